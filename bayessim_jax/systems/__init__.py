@@ -1,0 +1,48 @@
+"""Systems as pure functions of θ, their tasks, and the registry that the command line reads."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from bayessim_jax.systems.acrobot import Acrobot as Acrobot
+from bayessim_jax.systems.acrobot import Raise as Raise
+from bayessim_jax.systems.cartpole import Balance as Balance
+from bayessim_jax.systems.cartpole import CartPole as CartPole
+from bayessim_jax.systems.functional import from_functions as from_functions
+from bayessim_jax.systems.pendulum import Pendulum as Pendulum
+from bayessim_jax.systems.pendulum import SwingUp as SwingUp
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from bayessim_jax.contracts import System, Task
+
+__all__ = ["SYSTEMS", "Entry", "lookup"]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A registered system: how to make it, its task, and the learner the paper trains on it."""
+
+    system: Callable[..., System[Any]]
+    task: Callable[..., Task[Any]]
+    learner: str
+    summary: str
+
+
+SYSTEMS: dict[str, Entry] = {
+    "cartpole": Entry(CartPole.create, Balance, "ppo", "keep a pole upright on a cart that is pushed left or right"),
+    "pendulum": Entry(Pendulum.create, SwingUp, "sac", "swing a rod up with a motor too weak to lift it at once"),
+    "acrobot": Entry(Acrobot.create, Raise, "ppo", "swing two links up with a motor at the elbow only"),
+}
+
+
+def lookup(name: str) -> Entry:
+    """Find a registered system, or raise `ValueError` with the near misses."""
+    if name in SYSTEMS:
+        return SYSTEMS[name]
+    near = difflib.get_close_matches(name, SYSTEMS, n=1, cutoff=0.4)
+    hint = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(SYSTEMS)}."
+    raise ValueError(f"unknown system {name!r}: {hint}")
