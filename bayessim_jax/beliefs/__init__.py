@@ -1,1 +1,1 @@
-
+"""Beliefs over θ: uniform box, Gaussian mixture, truncated mixture, particles."""

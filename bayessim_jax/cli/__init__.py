@@ -1,1 +1,1 @@
-
+"""The `bayessim` command: one file per subcommand."""

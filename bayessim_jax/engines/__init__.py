@@ -1,1 +1,1 @@
-
+"""Engines: what steps a system, and the Gymnasium target."""

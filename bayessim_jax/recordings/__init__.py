@@ -1,1 +1,1 @@
-
+"""Run folders and recordings on disk."""
