@@ -1,0 +1,82 @@
+"""The Gaussian mixture: what an estimator returns, and what the algebra of the proposal correction works on."""
+
+from __future__ import annotations
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from bayessim_jax.beliefs.triangular import factor
+from bayessim_jax.contracts import Scalar
+
+with warnings.catch_warnings():
+    warnings.filterwarnings("ignore", category=DeprecationWarning)
+    import distrax
+
+__all__ = ["GaussianMixture", "moment_match"]
+
+
+@struct.dataclass
+class GaussianMixture:
+    """Σₖ αₖ N(θ; μₖ, Lₖ Lₖᵀ) with αₖ ∝ exp(log_weights), in the units of θ.
+
+    `log_weights` need not be normalized: every method normalizes them, and after `product` their log-sum-exp is the
+    mass ∫ a b. `scale_trils` are lower triangular with a positive diagonal.
+    """
+
+    log_weights: Float[Array, " components"]
+    means: Float[Array, "components d"]
+    scale_trils: Float[Array, "components d d"]
+
+    @property
+    def weights(self) -> Float[Array, " components"]:
+        """Normalized weights αₖ."""
+        return jax.nn.softmax(self.log_weights)
+
+    def distribution(self) -> distrax.MixtureSameFamily:
+        """The same law as a distrax distribution."""
+        return distrax.MixtureSameFamily(
+            distrax.Categorical(logits=self.log_weights),
+            distrax.MultivariateNormalTri(self.means, self.scale_trils),
+        )
+
+    def sample(self, key: PRNGKeyArray) -> Float[Array, " d"]:
+        """One draw of θ."""
+        return self.distribution().sample(seed=key)
+
+    def log_prob(self, theta: Float[Array, " d"]) -> Scalar:
+        """Normalized log density, differentiable in θ and in every leaf."""
+        return self.distribution().log_prob(theta)
+
+    def mean(self) -> Float[Array, " d"]:
+        """E θ = Σₖ αₖ μₖ."""
+        return self.weights @ self.means
+
+    def covariance(self) -> Float[Array, "d d"]:
+        """Cov θ = Σₖ αₖ (Lₖ Lₖᵀ + (μₖ − E θ)(μₖ − E θ)ᵀ)."""
+        spread = self.means - self.mean()
+        within = jnp.einsum("k,kij,klj->il", self.weights, self.scale_trils, self.scale_trils)
+        return within + jnp.einsum("k,ki,kj->ij", self.weights, spread, spread)
+
+    def marginal(self, axes: tuple[int, ...]) -> GaussianMixture:
+        """The law of the named axes of θ, in the order given."""
+        index = jnp.array(axes)
+        return self.replace(means=self.means[:, index], scale_trils=jax.vmap(factor)(self.scale_trils[:, index]))
+
+    def affine(self, shift: Float[Array, " d"], scale: Float[Array, " d"]) -> GaussianMixture:
+        """The law of shift + scale · z, axis by axis, where this mixture is the law of z; no scale may be zero."""
+        sign = jnp.where(scale < 0, -1.0, 1.0)
+        return self.replace(
+            means=shift + scale * self.means, scale_trils=scale[:, None] * self.scale_trils * sign[None, :]
+        )
+
+
+def moment_match(mixture: GaussianMixture) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
+    """The Gaussian with the mixture's mean and covariance, as (mean, scale_tril): the nearest one in KL(mixture‖·)."""
+    mean, root = mixture.mean(), jnp.sqrt(mixture.weights)
+    within = jnp.moveaxis(root[:, None, None] * mixture.scale_trils, 0, 1).reshape(mean.size, -1)
+    between = (root[:, None] * (mixture.means - mean)).T
+    return mean, factor(jnp.concatenate([within, between], axis=1))

@@ -1,0 +1,35 @@
+"""Small triangular factors: covariances are kept as L with Σ = L Lᵀ and never squared, which float32 would not bear."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Float
+
+from bayessim_jax.contracts import Scalar
+
+__all__ = ["factor", "invert", "log_normal"]
+
+
+def factor(a: Float[Array, "d m"]) -> Float[Array, "d d"]:
+    """Lower triangular L with L Lᵀ = A Aᵀ and a positive diagonal, through a QR factorization of Aᵀ.
+
+    Where A Aᵀ is singular the diagonal is raised to the rounding error of its row, so that log det stays finite.
+    """
+    lower = jnp.linalg.qr(a.T, mode="r").T
+    lower = lower * jnp.where(jnp.diagonal(lower) < 0, -1.0, 1.0)
+    info = jnp.finfo(a.dtype)
+    floor = info.eps * jnp.sqrt((a**2).sum(-1) + info.tiny)
+    return lower + jnp.diag(jnp.maximum(jnp.diagonal(lower), floor) - jnp.diagonal(lower))
+
+
+def invert(lower: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """L⁻¹ of a lower triangular L."""
+    return solve_triangular(lower, jnp.eye(lower.shape[-1], dtype=lower.dtype), lower=True)
+
+
+def log_normal(difference: Float[Array, " d"], lower: Float[Array, "d d"]) -> Scalar:
+    """log N(x; μ, L Lᵀ) for x − μ = `difference`."""
+    white = solve_triangular(lower, difference, lower=True)
+    scale = jnp.log(jnp.diagonal(lower)).sum() + 0.5 * difference.shape[-1] * jnp.log(2 * jnp.pi)
+    return -0.5 * (white**2).sum() - scale

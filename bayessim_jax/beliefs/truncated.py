@@ -1,0 +1,153 @@
+"""The belief of the outer loop: a Gaussian mixture cut to the prior's box, with a share of the prior kept."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from bayessim_jax.beliefs.box_probability import box_probability, condition, lattice
+from bayessim_jax.beliefs.mixture import GaussianMixture
+from bayessim_jax.beliefs.triangular import factor, log_normal
+from bayessim_jax.contracts import Box, Scalar
+
+__all__ = ["Truncated"]
+
+_CANDIDATES = 16
+_MOMENT_POINTS = 1024
+
+
+@struct.dataclass
+class Truncated:
+    """p(θ) = s U(θ; box) + (1 − s) q(θ) 1[θ ∈ box] / ∫_box q, with q a Gaussian mixture and s the prior's share.
+
+    With s = 1 it is the uniform prior: prior, proposal and posterior are one type and one scan carry.
+    """
+
+    mixture: GaussianMixture
+    box: Box
+    prior_share: Scalar
+
+    @classmethod
+    def uniform(cls, box: Box, components: int) -> Truncated:
+        """The uniform prior on the box, in the shape of a posterior with that many components."""
+        return cls(_idle(box, components), box, jnp.ones((), box.low.dtype))
+
+    @classmethod
+    def create(cls, mixture: GaussianMixture, box: Box, prior_share: float | Scalar = 0.0) -> Truncated:
+        """Cut a mixture to the box. One with no representable mass in it gives the prior, told by `prior_share` = 1."""
+        whole = cls(mixture, box, jnp.asarray(prior_share, box.low.dtype))
+        sound = jnp.isfinite(whole.log_mass())
+        for leaf in jax.tree.leaves(mixture):
+            sound &= ~jnp.isnan(leaf).any()
+        safe = cls.uniform(box, mixture.log_weights.size)
+        return jax.tree.map(lambda a, b: jnp.where(sound, a, b), whole, safe)
+
+    def log_mass(self) -> Scalar:
+        """log ∫_box q(θ) dθ: how much of the mixture the box holds."""
+        return jax.nn.logsumexp(self._log_shares())
+
+    def sample(self, key: PRNGKeyArray) -> Float[Array, " d"]:
+        """One draw of θ, strictly inside the box and without atoms on its bounds.
+
+        A component is chosen by αₖ Zₖ, then θ is drawn axis by axis from the conditionals cut to the box; one of 16
+        candidates on a randomly shifted lattice is kept by its weight, which corrects the order of the axes.
+
+        Source: Genz 1992
+        """
+        d, dtype = self.box.size, self.box.low.dtype
+        pick_key, inner_key, flat_key, share_key = jax.random.split(key, 4)
+        index = jax.random.categorical(pick_key, self._log_shares())
+        mean, scale_tril = self.mixture.means[index], self.mixture.scale_trils[index]
+        edge = jnp.finfo(dtype).eps
+        shift, last, pick = jnp.split(jax.random.uniform(inner_key, (d + 1,), dtype), [d - 1, d])
+        u = jnp.mod(lattice(_CANDIDATES if d > 1 else 1, d - 1) + shift, 1.0).clip(edge, 1 - edge)
+        log_weights, _, _ = jax.vmap(lambda v: condition(mean, scale_tril, self.box.low, self.box.high, v))(u)
+        ladder = jnp.cumsum(jax.nn.softmax(log_weights))
+        chosen = u[jnp.minimum((ladder < pick * ladder[-1]).sum(), u.shape[0] - 1)]
+        _, _, fractions = condition(
+            mean, scale_tril, self.box.low, self.box.high, jnp.append(chosen, last.clip(edge, 1 - edge))
+        )
+        flat = jax.random.bernoulli(share_key, self.prior_share)
+        fraction = jnp.where(flat, jax.random.uniform(flat_key, (d,), dtype), jnp.stack(fractions))
+        inner_low, inner_high = jnp.nextafter(self.box.low, self.box.high), jnp.nextafter(self.box.high, self.box.low)
+        return jnp.clip(self.box.low + fraction * self.box.width, inner_low, inner_high)
+
+    def log_prob(self, theta: Float[Array, " d"]) -> Scalar:
+        """Normalized log density in raw units; −∞ outside the box."""
+        cut = self.mixture.log_prob(theta) - self.log_mass()
+        flat = -jnp.log(self.box.width).sum()
+        return jnp.where(self.box.contains(theta), self._blend(flat, cut), -jnp.inf)
+
+    def mean(self) -> Float[Array, " d"]:
+        """E θ of the truncated law, by 1024 quasi-random points for each component."""
+        middle = 0.5 * (self.box.low + self.box.high)
+        weights, theta = self._points()
+        return self.prior_share * middle + (1 - self.prior_share) * weights @ theta
+
+    def covariance(self) -> Float[Array, "d d"]:
+        """Cov θ of the truncated law, by the same points."""
+        mean, middle = self.mean(), 0.5 * (self.box.low + self.box.high)
+        weights, theta = self._points()
+        cut = jnp.einsum("n,ni,nj->ij", weights, theta - mean, theta - mean)
+        flat = jnp.diag(self.box.width**2 / 12) + jnp.outer(middle - mean, middle - mean)
+        return self.prior_share * flat + (1 - self.prior_share) * cut
+
+    def marginal_log_prob(self, axis: int, grid: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Log density of one axis of θ at the points of a grid, in raw units; −∞ outside the box.
+
+        p(θ_i = g) ∝ Σₖ αₖ N(g; μₖᵢ, Σₖᵢᵢ) P(the other axes lie in the box | θ_i = g).
+        """
+        order = jnp.array([axis, *(j for j in range(self.box.size) if j != axis)])
+        low, high = self.box.low[order], self.box.high[order]
+        means = self.mixture.means[:, order]
+        trils = jax.vmap(factor)(self.mixture.scale_trils[:, order])
+
+        def unnormalized(g: Scalar) -> Scalar:
+            centred = g - means[:, :1]
+            logs = jax.nn.log_softmax(self.mixture.log_weights) + jax.vmap(log_normal)(centred, trils[:, :1, :1])
+            if self.box.size > 1:
+                rest = means[:, 1:] + trils[:, 1:, 0] * centred / trils[:, :1, 0]
+                logs = logs + box_probability(rest, trils[:, 1:, 1:], low[1:], high[1:])
+            return jax.nn.logsumexp(logs)
+
+        cut = jax.vmap(unnormalized)(grid) - self.log_mass()
+        inside = (grid >= low[0]) & (grid <= high[0])
+        return jnp.where(inside, self._blend(-jnp.log(high[0] - low[0]), cut), -jnp.inf)
+
+    def _log_shares(self) -> Float[Array, " components"]:
+        """log αₖ Zₖ, Zₖ the mass of component k in the box."""
+        masses = box_probability(self.mixture.means, self.mixture.scale_trils, self.box.low, self.box.high)
+        return jax.nn.log_softmax(self.mixture.log_weights) + masses
+
+    def _blend(self, flat: Scalar, cut: Float[Array, "..."]) -> Float[Array, "..."]:
+        return jnp.logaddexp(_log(self.prior_share) + flat, _log(1 - self.prior_share) + cut)
+
+    def _points(self) -> tuple[Float[Array, " points"], Float[Array, "points d"]]:
+        """Weighted points of the mixture's part; the weights sum to one."""
+        u = lattice(_MOMENT_POINTS, self.box.size)
+
+        def walk(mean: Array, scale_tril: Array, v: Array) -> tuple[Scalar, Array]:
+            log_weight, _, fractions = condition(mean, scale_tril, self.box.low, self.box.high, v)
+            return log_weight, jnp.stack(fractions)
+
+        over = jax.vmap(jax.vmap(walk, (None, None, 0)), (0, 0, None))
+        log_weights, fractions = over(self.mixture.means, self.mixture.scale_trils, u)
+        weights = jax.nn.softmax((jax.nn.log_softmax(self.mixture.log_weights)[:, None] + log_weights).ravel())
+        return weights, self.box.low + fractions.reshape(-1, self.box.size) * self.box.width
+
+
+def _log(share: Scalar) -> Scalar:
+    """log share, −∞ at zero with a derivative of zero."""
+    return jnp.where(share > 0, jnp.log(jnp.where(share > 0, share, 1.0)), -jnp.inf)
+
+
+def _idle(box: Box, components: int) -> GaussianMixture:
+    """A mixture with the moments of the uniform law, to fill the place of one that does not exist yet."""
+    d, dtype = box.size, box.low.dtype
+    return GaussianMixture(
+        jnp.zeros(components, dtype),
+        jnp.broadcast_to(0.5 * (box.low + box.high), (components, d)),
+        jnp.broadcast_to(jnp.diag(box.width / jnp.sqrt(jnp.asarray(12.0, dtype))), (components, d, d)),
+    )
