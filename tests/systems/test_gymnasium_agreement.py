@@ -118,7 +118,7 @@ def test_whole_trajectories_agree(runs):
 
 
 def test_observations_are_those_of_gymnasium(runs):
-    name, (theta, states, *_) = runs
+    name, (theta, *_) = runs
     env_id, configure, _ = GYMNASIUM[name]
     env = gymnasium.make(env_id, disable_env_checker=True).unwrapped
     configure(env, theta[0])

@@ -1,0 +1,193 @@
+"""Action distributions: what a policy network's outputs mean.
+
+A head turns `outputs` numbers into a distribution over raw actions and a raw action into the vector that a system
+takes. Noise is an argument, so that a learner can draw it for a whole batch at once.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from bayessim_jax.contracts import Box, Discrete, Scalar
+
+__all__ = ["Categorical", "Gaussian", "Head", "SquashedGaussian", "choose_head"]
+
+_HALF_LOG_2PI = 0.9189385332046727
+
+
+class Head(Protocol):
+    """A distribution over raw actions a, given network outputs p."""
+
+    @property
+    def outputs(self) -> int:
+        """Network outputs it takes."""
+        ...
+
+    def noise(self, key: PRNGKeyArray, batch: tuple[int, ...]) -> Float[Array, "*batch noise"]:
+        """What `sample` makes an action of."""
+        ...
+
+    def sample(self, p: Float[Array, " outputs"], noise: Float[Array, " noise"]) -> Float[Array, " act"]:
+        """A raw action."""
+        ...
+
+    def mode(self, p: Float[Array, " outputs"]) -> Float[Array, " act"]:
+        """The most probable raw action."""
+        ...
+
+    def log_prob(self, p: Float[Array, " outputs"], raw: Float[Array, " act"]) -> Scalar:
+        """Log density (or mass) of a raw action."""
+        ...
+
+    def entropy(self, p: Float[Array, " outputs"]) -> Scalar:
+        """Entropy in nats."""
+        ...
+
+    def action(self, raw: Float[Array, " act"]) -> Float[Array, " act"]:
+        """The vector that the system takes, in its units."""
+        ...
+
+
+@struct.dataclass
+class Categorical:
+    """P(a) ∝ exp pₐ over indices 0 … count − 1."""
+
+    count: int = struct.field(pytree_node=False)
+
+    @property
+    def outputs(self) -> int:
+        """One logit for each action."""
+        return self.count
+
+    def noise(self, key: PRNGKeyArray, batch: tuple[int, ...]) -> Float[Array, "*batch count"]:
+        """Gumbel numbers."""
+        return jax.random.gumbel(key, (*batch, self.count))
+
+    def sample(self, p: Float[Array, " count"], noise: Float[Array, " count"]) -> Float[Array, " 1"]:
+        """The index of the largest p + noise."""
+        return jnp.argmax(p + noise, -1, keepdims=True).astype(p.dtype)
+
+    def mode(self, p: Float[Array, " count"]) -> Float[Array, " 1"]:
+        """The index of the largest logit."""
+        return jnp.argmax(p, -1, keepdims=True).astype(p.dtype)
+
+    def log_prob(self, p: Float[Array, " count"], raw: Float[Array, " 1"]) -> Scalar:
+        """Log softmax at the index."""
+        return jnp.sum(jax.nn.log_softmax(p) * (raw == jnp.arange(self.count)))
+
+    def entropy(self, p: Float[Array, " count"]) -> Scalar:
+        """−Σ P log P, in nats."""
+        return -jnp.sum(jax.nn.softmax(p) * jax.nn.log_softmax(p))
+
+    def action(self, raw: Float[Array, " 1"]) -> Float[Array, " 1"]:
+        """The index itself."""
+        return raw
+
+
+@struct.dataclass
+class Gaussian:
+    """a ~ N(mean, exp(2 s)) in units of the box's half-width about its centre, clipped to the box when it acts.
+
+    The network's outputs are (mean, s).
+    """
+
+    box: Box
+
+    @property
+    def outputs(self) -> int:
+        """Mean and log standard deviation of each axis."""
+        return 2 * self.box.size
+
+    def noise(self, key: PRNGKeyArray, batch: tuple[int, ...]) -> Float[Array, "*batch act"]:
+        """Standard normal numbers."""
+        return jax.random.normal(key, (*batch, self.box.size))
+
+    def sample(self, p: Float[Array, " outputs"], noise: Float[Array, " act"]) -> Float[Array, " act"]:
+        """Mean plus scaled noise, not yet clipped."""
+        mean, log_std = _split(p)
+        return mean + jnp.exp(log_std) * noise
+
+    def mode(self, p: Float[Array, " outputs"]) -> Float[Array, " act"]:
+        """The mean."""
+        return _split(p)[0]
+
+    def log_prob(self, p: Float[Array, " outputs"], raw: Float[Array, " act"]) -> Scalar:
+        """Log density of the action before it was clipped."""
+        mean, log_std = _split(p)
+        return jnp.sum(-0.5 * ((raw - mean) * jnp.exp(-log_std)) ** 2 - log_std - _HALF_LOG_2PI)
+
+    def entropy(self, p: Float[Array, " outputs"]) -> Scalar:
+        """Σ (s + ½ log 2πe), in nats."""
+        return jnp.sum(_split(p)[1] + 0.5 + _HALF_LOG_2PI)
+
+    def action(self, raw: Float[Array, " act"]) -> Float[Array, " act"]:
+        """Clipped to the box, in its units."""
+        return _to_box(self.box, jnp.clip(raw, -1.0, 1.0))
+
+
+@struct.dataclass
+class SquashedGaussian:
+    """a ~ N(mean, exp(2 s)); the system takes tanh a, stretched to the box.
+
+    `log_prob` is the density of tanh a, in half-widths of the box: log N(a) − Σ log(1 − tanh² a).
+
+    Source: Haarnoja et al. 2018
+    """
+
+    box: Box
+
+    @property
+    def outputs(self) -> int:
+        """Mean and log standard deviation of each axis."""
+        return 2 * self.box.size
+
+    def noise(self, key: PRNGKeyArray, batch: tuple[int, ...]) -> Float[Array, "*batch act"]:
+        """Standard normal numbers."""
+        return jax.random.normal(key, (*batch, self.box.size))
+
+    def sample(self, p: Float[Array, " outputs"], noise: Float[Array, " act"]) -> Float[Array, " act"]:
+        """Mean plus scaled noise, before tanh."""
+        mean, log_std = _bounded(p)
+        return mean + jnp.exp(log_std) * noise
+
+    def mode(self, p: Float[Array, " outputs"]) -> Float[Array, " act"]:
+        """The mean, before tanh."""
+        return _split(p)[0]
+
+    def log_prob(self, p: Float[Array, " outputs"], raw: Float[Array, " act"]) -> Scalar:
+        """Log density of tanh a."""
+        mean, log_std = _bounded(p)
+        normal = -0.5 * ((raw - mean) * jnp.exp(-log_std)) ** 2 - log_std - _HALF_LOG_2PI
+        return jnp.sum(normal - 2.0 * (jnp.log(2.0) - raw - jax.nn.softplus(-2.0 * raw)))
+
+    def entropy(self, p: Float[Array, " outputs"]) -> Scalar:
+        """Of the Gaussian before tanh, in nats; the squashed one has no closed form."""
+        return jnp.sum(_bounded(p)[1] + 0.5 + _HALF_LOG_2PI)
+
+    def action(self, raw: Float[Array, " act"]) -> Float[Array, " act"]:
+        """Squashed and stretched to the box, in its units."""
+        return _to_box(self.box, jnp.tanh(raw))
+
+
+def choose_head(actions: Box | Discrete) -> Categorical | Gaussian:
+    """Indices are drawn from a categorical distribution, vectors from a Gaussian."""
+    return Categorical(actions.count) if isinstance(actions, Discrete) else Gaussian(actions)
+
+
+def _split(p: Any) -> tuple[Any, Any]:
+    half = p.shape[-1] // 2
+    return p[..., :half], p[..., half:]
+
+
+def _bounded(p: Any) -> tuple[Any, Any]:
+    mean, log_std = _split(p)
+    return mean, jnp.clip(log_std, -10.0, 2.0)
+
+
+def _to_box(box: Box, unit: Any) -> Any:
+    return (box.low + box.high) / 2 + box.width / 2 * unit
