@@ -1,0 +1,224 @@
+"""Recurrent encoders: a recording becomes a fixed-length embedding, with no hand-made summaries.
+
+Every encoder is a pair of pure functions over a batch of sequences. It reads the same features at each step: the
+observations, their finite differences, the action, and whether the step happened.
+"""
+
+from __future__ import annotations
+
+import difflib
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from bayessim_jax.contracts import Recording
+
+__all__ = ["ENCODERS", "Encoder", "GatedLinear", "Lstm", "lookup_encoder", "transition_features"]
+
+
+class Encoder(Protocol):
+    """Maps features of shape (batch, steps, features) and a mask of valid steps to (batch, size)."""
+
+    def init(self, key: PRNGKeyArray, steps: int, features: int) -> Any:
+        """Random weights."""
+        ...
+
+    def apply(
+        self, params: Any, x: Float[Array, "batch steps features"], valid: Bool[Array, "batch steps"]
+    ) -> Float[Array, "batch size"]:
+        """Embed every sequence."""
+        ...
+
+
+def transition_features(recording: Recording) -> Float[Array, "steps features"]:
+    """What the encoder reads of transition t: yₜ, yₜ₊₁ − yₜ and uₜ; zero where the transition did not happen.
+
+    The finite differences carry what θ changes; without them the network has to learn to subtract.
+    """
+    now, later = recording.observations[:-1], recording.observations[1:]
+    x = jnp.concatenate([now, later - now, recording.actions], axis=-1)
+    return jnp.where(recording.valid[:, None], x, 0.0)
+
+
+def frames(
+    x: Float[Array, "batch steps features"], valid: Bool[Array, "batch steps"], frame: int
+) -> tuple[Float[Array, "batch tokens inputs"], Bool[Array, "batch tokens"]]:
+    """Join every `frame` successive steps into one token, valid where at least one of its steps is."""
+    batch, steps, features = x.shape
+    frame = min(frame, steps)
+    tokens = -(-steps // frame)
+    pad = tokens * frame - steps
+    x = jnp.pad(x, ((0, 0), (0, pad), (0, 0))).reshape(batch, tokens, frame * features)
+    return x, jnp.pad(valid, ((0, 0), (0, pad))).reshape(batch, tokens, frame).any(-1)
+
+
+def glorot(key: PRNGKeyArray, rows: int, columns: int) -> Float[Array, "rows columns"]:
+    """Uniform weights with variance 2/(rows + columns)."""
+    limit = jnp.sqrt(6.0 / (rows + columns))
+    return jax.random.uniform(key, (rows, columns), minval=-limit, maxval=limit)
+
+
+@struct.dataclass
+class Lstm:
+    """The paper's encoder: a long short-term memory, read out after the last valid step.
+
+        s' = σ(f) s + σ(i) tanh(c),   h' = σ(o) tanh(s'),   (i, f, o, c) = W x + U h + b
+
+    Invalid steps leave h and s as they are.
+
+    Source: Hochreiter and Schmidhuber 1997
+    """
+
+    size: int = struct.field(pytree_node=False, default=64)
+    frame: int = struct.field(pytree_node=False, default=1)
+    """Successive steps that are read at once: a recurrence of 50/frame steps is that much faster."""
+
+    def init(self, key: PRNGKeyArray, steps: int, features: int) -> dict[str, Array]:
+        """Glorot weights, and a forget gate that starts open."""
+        w_key, u_key = jax.random.split(key)
+        h = self.size
+        return {
+            "w": glorot(w_key, min(self.frame, steps) * features, 4 * h),
+            "u": glorot(u_key, h, 4 * h),
+            "b": jnp.zeros(4 * h).at[h : 2 * h].set(1.0),
+        }
+
+    def apply(
+        self, params: Any, x: Float[Array, "batch steps features"], valid: Bool[Array, "batch steps"]
+    ) -> Float[Array, "batch size"]:
+        """The hidden state after the last valid step."""
+        h = self.size
+        x, valid = frames(x, valid, self.frame)
+        # σ(a) = ½ + ½ tanh(a/2): with the halves folded into the weights all four gates are one tanh
+        half = jnp.concatenate([jnp.full(3 * h, 0.5), jnp.ones(h)])
+        inputs = jnp.swapaxes(x, 0, 1) @ (params["w"] * half) + params["b"] * half
+        return _lstm(params["u"] * half, inputs, jnp.swapaxes(valid, 0, 1))
+
+
+def _gates(t: Float[Array, "batch gates"]) -> tuple[Array, Array, Array, Array]:
+    i, f, o, c = jnp.split(t, 4, axis=-1)
+    return 0.5 + 0.5 * i, 0.5 + 0.5 * f, 0.5 + 0.5 * o, c
+
+
+@jax.custom_vjp
+def _lstm(u: Float[Array, "h gates"], inputs: Float[Array, "steps batch gates"], valid: Array) -> Array:
+    return _lstm_forward(u, inputs, valid)[0]
+
+
+def _lstm_forward(u: Array, inputs: Array, valid: Array) -> tuple[Array, Any]:
+    # The barriers keep XLA from computing each tanh once for every use of it, which doubled the time of a step.
+    barrier = jax.lax.optimization_barrier
+
+    def step(carry: Any, x: Any) -> Any:
+        h, s = carry
+        z, on = x
+        t = barrier(jnp.tanh(z + h @ u))
+        i, f, o, c = _gates(t)
+        s_next = barrier(f * s + i * c)
+        bounded = jnp.tanh(s_next)
+        on = on[:, None]
+        return (jnp.where(on, o * bounded, h), jnp.where(on, s_next, s)), (h, s, t, bounded)
+
+    zeros = jnp.zeros((inputs.shape[1], u.shape[0]), inputs.dtype)
+    (h, _), saved = jax.lax.scan(step, (zeros, zeros), (inputs, valid))
+    return h, (u, valid, saved)
+
+
+def _lstm_backward(residuals: Any, dh: Array) -> tuple[Array, Array, None]:
+    u, valid, (hs, ss, ts, boundeds) = residuals
+    barrier = jax.lax.optimization_barrier
+    u_transposed = u.T
+
+    def step(carry: Any, x: Any) -> Any:
+        dh, ds = carry
+        s, t, bounded, on = x
+        on = on[:, None]
+        i, f, o, c = _gates(t)
+        dh_on, ds_on = jnp.where(on, dh, 0.0), jnp.where(on, ds, 0.0)
+        ds_on = barrier(ds_on + dh_on * o * (1 - bounded * bounded))
+        left = jnp.concatenate([ds_on * c * 0.5, ds_on * s * 0.5, dh_on * bounded * 0.5, ds_on * i], axis=-1)
+        dz = barrier(left * (1 - t * t))
+        return (dz @ u_transposed + jnp.where(on, 0.0, dh), ds_on * f + jnp.where(on, 0.0, ds)), dz
+
+    _, dzs = jax.lax.scan(step, (dh, jnp.zeros_like(dh)), (ss, ts, boundeds, valid), reverse=True)
+    # one large product after the loop, not one small one in every step
+    du = hs.reshape(-1, hs.shape[-1]).T @ dzs.reshape(-1, dzs.shape[-1])
+    return du, dzs, None
+
+
+_lstm.defvjp(_lstm_forward, _lstm_backward)
+
+
+@struct.dataclass
+class GatedLinear:
+    """A gated linear recurrence over short frames: every product is outside the recurrence, so it trains fast.
+
+    `frame` successive steps are one token; each layer is
+
+        h' = a ⊙ h + (1 − a) ⊙ W_v x,   a = σ(W_a x + b),   y = x + W_o (h ⊙ swish(W_g x))
+
+    and the embedding is the state after the last token beside the mean over the tokens.
+
+    Source: Feng et al. 2024
+    """
+
+    width: int = struct.field(pytree_node=False, default=64)
+    layers: int = struct.field(pytree_node=False, default=2)
+    frame: int = struct.field(pytree_node=False, default=5)
+
+    def init(self, key: PRNGKeyArray, steps: int, features: int) -> dict[str, Any]:
+        """Glorot weights; memories that start at a spread of time scales."""
+        keys = jax.random.split(key, self.layers + 1)
+        w = self.width
+        layers = [
+            {
+                "mix": glorot(jax.random.fold_in(k, 0), w, 3 * w),
+                "out": glorot(jax.random.fold_in(k, 1), w, w),
+                "b": jnp.linspace(-1.0, 4.0, w),
+            }
+            for k in keys[1:]
+        ]
+        frame = min(self.frame, steps)
+        return {"embed": glorot(keys[0], frame * features, w), "b": jnp.zeros(w), "layers": layers}
+
+    def apply(
+        self, params: Any, x: Float[Array, "batch steps features"], valid: Bool[Array, "batch steps"]
+    ) -> Float[Array, "batch size"]:
+        """The last state beside the mean over tokens with at least one valid step."""
+        x, valid = frames(x, valid, self.frame)
+        on = valid[..., None]
+        y = jax.nn.gelu(x @ params["embed"] + params["b"])
+        for layer in params["layers"]:
+            decay, value, gate = jnp.split(y @ layer["mix"], 3, axis=-1)
+            decay = jnp.where(on, jax.nn.sigmoid(decay + layer["b"]), 1.0)
+            h = linear_scan(decay, (1 - decay) * value)
+            y = y + (h * jax.nn.swish(gate)) @ layer["out"]
+        count = jnp.maximum(on.sum(1), 1)
+        last = jnp.take_along_axis(y, (count - 1)[:, None], axis=1)[:, 0]
+        return jnp.concatenate([last, (y * on).sum(1) / count], axis=-1)
+
+
+def linear_scan(
+    decay: Float[Array, "batch steps width"], value: Float[Array, "batch steps width"]
+) -> Float[Array, "batch steps width"]:
+    """hₜ = aₜ hₜ₋₁ + vₜ from h₋₁ = 0, along the second axis."""
+
+    def combine(left: tuple[Array, Array], right: tuple[Array, Array]) -> tuple[Array, Array]:
+        return left[0] * right[0], left[1] * right[0] + right[1]
+
+    return jax.lax.associative_scan(combine, (decay, value), axis=1)[1]
+
+
+ENCODERS: dict[str, Encoder] = {"gated_linear": GatedLinear(), "lstm": Lstm()}
+
+
+def lookup_encoder(name: str) -> Encoder:
+    """Find an encoder by name, or raise `ValueError` with the near miss."""
+    if name in ENCODERS:
+        return ENCODERS[name]
+    near = difflib.get_close_matches(name, ENCODERS, n=1, cutoff=0.4)
+    hint = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(ENCODERS)}."
+    raise ValueError(f"unknown encoder {name!r}: {hint}")

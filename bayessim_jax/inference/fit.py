@@ -1,0 +1,148 @@
+"""Fitting a conditional density: minibatches, early stopping on a validation split, and what to distrust."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from bayessim_jax.contracts import Scalar
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["FitInfo", "Schedule", "fit", "held_out"]
+
+
+@struct.dataclass
+class Schedule:
+    """How long and how to train. An epoch draws `draws` pairs in proportion to their weights, in batches."""
+
+    learning_rate: float | Scalar = 2e-3
+    epochs: int = struct.field(pytree_node=False, default=200)
+    draws: int = struct.field(pytree_node=False, default=200)
+    batch: int = struct.field(pytree_node=False, default=50)
+    check_every: int = struct.field(pytree_node=False, default=5)
+    """Epochs between looks at the validation pairs."""
+    patience: int = struct.field(pytree_node=False, default=200)
+    """Epochs without a better validation score after which training stops."""
+    validate: int = struct.field(pytree_node=False, default=10)
+    """Every n-th pair is held out; 0 keeps none out, trains to the end and keeps the last weights."""
+    validation_draws: int = struct.field(pytree_node=False, default=200)
+    weight_decay: float = struct.field(pytree_node=False, default=1e-4)
+
+
+@struct.dataclass
+class FitInfo:
+    """What a person wants to see of a fit: scores are mean log densities in the units of the fit."""
+
+    log_q_train: Scalar
+    """Mean over the last epoch before the weights that were kept."""
+    log_q_validation: Scalar
+    """At the weights that were kept; NaN without a validation split."""
+    best_epoch: Int[Array, ""]
+    epochs: Int[Array, ""]
+    """Epochs run, at most the schedule's."""
+    coverage90: Scalar
+    """Share of held-out pairs inside their own 90 % credible set; far below 0.9 means over-confident."""
+    overfit: Bool[Array, ""]
+    """The validation score fell well below its best while the training score rose."""
+    overconfident: Bool[Array, ""]
+    """Coverage at 90 % is below what chance allows (three standard errors)."""
+    nonfinite: Int[Array, ""]
+    """Updates skipped because loss or gradient was not finite."""
+
+
+def held_out(n: int, every: int) -> Bool[Array, " n"]:
+    """Which rows of a pool are never trained on: the same in every round, so warm weights have not seen them."""
+    return jnp.zeros(n, bool) if every == 0 else jnp.arange(n) % every == every - 1
+
+
+def systematic(key: PRNGKeyArray, weights: Float[Array, " n"], draws: int) -> Int[Array, " draws"]:
+    """Indices in proportion to weights with the least possible variance, in random order."""
+    shuffle_key, offset_key = jax.random.split(key)
+    cumulative = jnp.cumsum(weights)
+    points = (jnp.arange(draws) + jax.random.uniform(offset_key)) / draws * cumulative[-1]
+    picks = jnp.clip(jnp.searchsorted(cumulative, points), 0, weights.size - 1)
+    return jax.random.permutation(shuffle_key, picks)
+
+
+def fit(
+    key: PRNGKeyArray,
+    params: Any,
+    log_prob: Callable[[Any, Any, Float[Array, "batch d"]], Float[Array, " batch"]],
+    inputs: Any,
+    z: Float[Array, "n d"],
+    weights: Float[Array, " n"],
+    schedule: Schedule,
+) -> tuple[Any, FitInfo]:
+    """Maximize Σ wᵢ log q(zᵢ | inputsᵢ) by Adam with a cosine rate, and keep the weights best on held-out pairs.
+
+    `inputs` is a pytree with leading axis n. A pair with weight zero is never drawn. A batch whose loss or gradient is
+    not finite is skipped and counted. Training stops when nothing improved for `patience` epochs.
+    """
+    n = z.shape[0]
+    out = held_out(n, schedule.validate)
+    train_weights, out_weights = jnp.where(out, 0.0, weights), jnp.where(out, weights, 0.0)
+    validate_key, epochs_key = jax.random.split(key)
+    shown = systematic(validate_key, out_weights, min(schedule.validation_draws, n)) if schedule.validate else None
+    batches = max(schedule.draws // schedule.batch, 1)
+    total = schedule.epochs * batches
+    optimizer = optax.chain(optax.clip_by_global_norm(5.0), optax.scale_by_adam())
+
+    def take(tree: Any, rows: Any) -> Any:
+        return jax.tree.map(lambda leaf: leaf[rows], tree)
+
+    def score(params: Any) -> Scalar:
+        return log_prob(params, take(inputs, shown), z[shown]).mean()
+
+    def update(carry: Any, rows: Any) -> Any:
+        params, opt_state, count, skipped = carry
+        loss, grads = jax.value_and_grad(lambda p: -log_prob(p, take(inputs, rows), z[rows]).mean())(params)
+        rate = schedule.learning_rate * 0.5 * (1 + jnp.cos(jnp.pi * count / total))
+        sound = jnp.isfinite(loss) & jnp.isfinite(optax.tree.norm(grads))
+        direction, new_opt_state = optimizer.update(grads, opt_state, params)
+        new_params = jax.tree.map(
+            lambda p, step: p - rate * (step + schedule.weight_decay * p), params, direction
+        )
+        keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(sound, a, b), new, old)  # noqa: E731
+        carry = (keep(new_params, params), keep(new_opt_state, opt_state), count + 1, skipped + ~sound)
+        return carry, jnp.where(sound, -loss, 0.0)
+
+    def epoch(carry: Any, index: Any) -> Any:
+        rows = systematic(jax.random.fold_in(epochs_key, index), train_weights, batches * schedule.batch)
+        carry, scores = jax.lax.scan(update, carry, rows.reshape(batches, schedule.batch))
+        return carry, scores.mean()
+
+    def block(loop: Any) -> Any:
+        carry, best, done, _ = loop
+        carry, scores = jax.lax.scan(epoch, carry, done + jnp.arange(schedule.check_every))
+        done = done + schedule.check_every
+        last = score(carry[0]) if schedule.validate else jnp.nan
+        better = (last > best["validation"]) if schedule.validate else jnp.array(True)
+        new = {"params": carry[0], "validation": last, "train": scores[-1], "epoch": done}
+        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, best)
+        return carry, best, done, {"validation": last, "train": scores[-1]}
+
+    def more(loop: Any) -> Any:
+        _, best, done, _ = loop
+        return (done + schedule.check_every <= schedule.epochs) & (done - best["epoch"] < schedule.patience)
+
+    low = jnp.array(-jnp.inf)
+    best = {"params": params, "validation": low, "train": low, "epoch": jnp.array(0)}
+    start = ((params, optimizer.init(params), jnp.array(0), jnp.array(0)), best, jnp.array(0))
+    carry, best, done, last = jax.lax.while_loop(more, block, (*start, {"validation": low, "train": low}))
+    return best["params"], FitInfo(
+        log_q_train=best["train"],
+        log_q_validation=best["validation"] if schedule.validate else jnp.array(jnp.nan),
+        best_epoch=best["epoch"],
+        epochs=done,
+        coverage90=jnp.array(jnp.nan),
+        overfit=(last["validation"] < best["validation"] - 0.5) & (last["train"] > best["train"]),
+        overconfident=jnp.array(False),
+        nonfinite=carry[3],
+    )
