@@ -21,15 +21,15 @@ def box_probability(
     high: Float[Array, " d"],
     points: int = 128,
 ) -> Float[Array, " components"]:
-    """log P(low ≤ θ ≤ high) under each N(μₖ, Lₖ Lₖᵀ); exact for d = 1, finite however small the mass is.
+    """Log P(low ≤ θ ≤ high) under each N(μₖ, Lₖ Lₖᵀ); exact for d = 1, finite however small the mass is.
 
     Source: Genz 1992
     """
     d = means.shape[-1]
-    u = lattice(points if d > 1 else 1, d - 1)
+    u = lattice(points if d > 1 else 1, d)
 
     def log_probability(mean: Float[Array, " d"], scale_tril: Float[Array, "d d"]) -> Scalar:
-        log_weights, _, _ = jax.vmap(lambda v: condition(mean, scale_tril, low, high, v))(u)
+        log_weights, _ = jax.vmap(lambda v: condition(mean, scale_tril, low, high, v))(u)
         return jax.nn.logsumexp(log_weights) - jnp.log(u.shape[0])
 
     return jax.vmap(log_probability)(means, scale_trils)
@@ -40,25 +40,27 @@ def condition(
     scale_tril: Float[Array, "d d"],
     low: Float[Array, " d"],
     high: Float[Array, " d"],
-    u: Float[Array, " drawn"],
-) -> tuple[Scalar, list[Scalar], list[Scalar]]:
-    """Walk along the axes: the mass of axis j given the earlier ones, and z_j drawn within it where u names one.
+    u: Float[Array, " d"],
+) -> tuple[Scalar, Float[Array, " d"]]:
+    """Walk along the axes of θ = μ + L z: the mass of each given the earlier ones, and z_j drawn within it by u_j.
 
-    θ = μ + L z. Returns the log product of the d masses, the z drawn, and where each θ_j lies between its bounds
-    (0 … 1). Averaged over uniform u in d − 1 dimensions, the product is the mass of the box.
+    Returns the log product of the masses, and where each θ_j lies between its bounds (0 … 1). Averaged over u uniform
+    in the cube the product is the mass of the box, whatever the last u is.
 
     Source: Genz 1992
     """
-    log_weight, drawn, fractions = jnp.zeros((), mean.dtype), [], []
-    for j in range(mean.size):
-        centre = mean[j] + sum((scale_tril[j, i] * drawn[i] for i in range(j)), jnp.zeros((), mean.dtype))
-        left, right = (low[j] - centre) / scale_tril[j, j], (high[j] - centre) / scale_tril[j, j]
-        log_weight = log_weight + log_mass(left, right)
-        if j < u.size:
-            z, fraction = quantile(u[j], left, right)
-            drawn.append(z)
-            fractions.append(fraction)
-    return log_weight, drawn, fractions
+
+    def step(carry: tuple[Scalar, Array], axis: tuple[Array, ...]) -> tuple[tuple[Scalar, Array], Scalar]:
+        log_weight, z = carry
+        j, centre, row, bottom, top, share = axis
+        centre = centre + row @ z
+        left, right = (bottom - centre) / row[j], (top - centre) / row[j]
+        drawn, fraction = quantile(share, left, right)
+        return (log_weight + log_mass(left, right), z.at[j].set(drawn)), fraction
+
+    start = (jnp.zeros((), mean.dtype), jnp.zeros_like(mean))
+    (log_weight, _), fractions = jax.lax.scan(step, start, (jnp.arange(mean.size), mean, scale_tril, low, high, u))
+    return log_weight, fractions
 
 
 def lattice(points: int, d: int) -> Float[Array, "points d"]:

@@ -1,18 +1,19 @@
 """The standard normal on an interval, without underflow: its log mass and its quantiles.
 
-Three regimes, joined where they agree to rounding: an interval narrower than 0.02 (the density is an exponential
-there), one that starts more than 10 standard deviations out (Mills' ratio), and the body. Intervals are mirrored to
-the negative side first, where the distribution function keeps its digits.
+Intervals are mirrored to the negative side first, where the distribution function keeps its digits. Three regimes meet
+where they agree to rounding: the body; an interval that starts more than 10 standard deviations out, by Mills' ratio;
+and one narrower than 0.02, where the density is an exponential.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.special import log_ndtr, ndtr, ndtri
-from jaxtyping import Array, Float
+from jax.scipy.special import erfc, ndtri
+from jaxtyping import Array, Bool
 
 from bayessim_jax.contracts import Scalar
 
@@ -23,16 +24,16 @@ _NARROW, _FAR = 0.02, -10.0
 
 @jax.custom_jvp
 def log_mass(low: Scalar, high: Scalar) -> Scalar:
-    """log(Φ(high) − Φ(low)) for low < high."""
+    """The log of Φ(high) − Φ(low), for low < high."""
     left, right, _ = _mirror(low, high)
-    width = right - left
-    gap = jnp.minimum(log_ndtr(left) - log_ndtr(right), -jnp.finfo(width.dtype).tiny)
-    wide = log_ndtr(right) + jnp.log(-jnp.expm1(gap))
-    middle = 0.5 * (left + right)
-    slope = -middle * width
-    steep = 0.5 * slope + jnp.log(-jnp.expm1(-slope)) - jnp.log(slope)
-    bend = jnp.where(slope < 0.1, slope**2 / 24, steep) - width**2 / 24
-    return jnp.where(width < _NARROW, _log_density(middle) + jnp.log(width) + bend, wide)
+    width, slope = right - left, -0.5 * (left + right) * (right - left)
+    under, over = _below(left), _below(-jnp.abs(right))
+    body = jnp.log(jnp.where(right > 0, 1 - under - over, over - under))
+    far = _log_density(right) + jnp.log(_mills(right) - jnp.exp(-slope) * _mills(left))
+    steep = 0.5 * slope + jnp.log(-jnp.expm1(-slope) / slope)
+    narrow = _log_density(0.5 * (left + right)) + jnp.log(width) - width**2 / 24
+    narrow = narrow + jnp.where(slope < 0.1, slope**2 / 24, steep)
+    return jnp.where(width < _NARROW, narrow, jnp.where(right < _FAR, far, body))
 
 
 @log_mass.defjvp
@@ -44,34 +45,34 @@ def _log_mass_jvp(primals: Any, tangents: Any) -> Any:
 
 @jax.custom_jvp
 def quantile(u: Scalar, low: Scalar, high: Scalar) -> tuple[Scalar, Scalar]:
-    """z in [low, high] below which a share u of the interval's mass lies, and (z − low)/(high − low).
+    """The z in [low, high] below which a share u of the interval's mass lies, and (z − low)/(high − low).
 
     The fraction keeps its digits close to the bound that the mass crowds at, where low + fraction · width would
     round z.
     """
     left, right, mirrored = _mirror(low, high)
-    width = right - left
-    below = jnp.where(mirrored, 1 - u, u)
-    above = jnp.where(mirrored, u, 1 - u)
+    width, slope = right - left, -0.5 * (left + right) * (right - left)
+    below, above = jnp.where(mirrored, 1 - u, u), jnp.where(mirrored, u, 1 - u)
 
-    mass = jnp.exp(log_mass(left, right))
-    from_left, from_right = ndtr(left) + below * mass, ndtr(-right) + above * mass
-    body = jnp.where(from_left < from_right, ndtri(from_left), -ndtri(from_right))
+    under, over = _below(left), _below(-jnp.abs(right))
+    mass = jnp.where(right > 0, 1 - under - over, over - under)
+    from_left, from_right = under + below * mass, jnp.where(right > 0, over, 1 - over) + above * mass
+    body = ndtri(jnp.minimum(from_left, from_right)) * jnp.where(from_left < from_right, 1.0, -1.0)
     body = jnp.clip(body, left, right)
 
-    distance = jnp.abs(right)
-    energy = -jnp.log1p(above * jnp.expm1(jnp.minimum(log_ndtr(left) - log_ndtr(right), 0.0)))
+    distance, mills = jnp.abs(right), _mills(right)
+    energy = -jnp.log1p(above * (jnp.exp(-slope) * _mills(left) / mills - 1))
     step = 2 * energy / (distance + jnp.sqrt(distance**2 + 2 * energy))
-    energy = jnp.maximum(energy - jnp.log1p(step / distance) + distance**-2 - (distance + step) ** -2, 0.0)
+    energy = jnp.maximum(energy + jnp.log(_mills(right - step) / mills), 0.0)
     far = 2 * energy / (distance + jnp.sqrt(distance**2 + 2 * energy)) / width
 
-    slope = -0.5 * (left + right) * width
     narrow = -jnp.log1p(above * jnp.expm1(-slope)) / slope
     narrow = jnp.where(slope < 1e-2, above - 0.5 * slope * above * below, narrow)
 
+    close = (width < _NARROW) | (right < _FAR)
     short = jnp.where(width < _NARROW, narrow, jnp.where(right < _FAR, far, (right - body) / width))
     short = jnp.clip(short, 0.0, 1.0)
-    z = jnp.where((width < _NARROW) | (right < _FAR), right - short * width, body)
+    z = jnp.where(close, right - short * width, body)
     return jnp.where(mirrored, -z, z), jnp.where(mirrored, short, 1 - short)
 
 
@@ -85,10 +86,20 @@ def _quantile_jvp(primals: Any, tangents: Any) -> Any:
     return (z, fraction), (d_z, d_fraction)
 
 
-def _mirror(low: Scalar, high: Scalar) -> tuple[Scalar, Scalar, Array]:
+def _mirror(low: Scalar, high: Scalar) -> tuple[Scalar, Scalar, Bool[Array, ""]]:
     mirrored = low + high > 0
     return jnp.where(mirrored, -high, low), jnp.where(mirrored, -low, high), mirrored
 
 
-def _log_density(z: Float[Array, "..."]) -> Float[Array, "..."]:
-    return -0.5 * z**2 - 0.5 * jnp.log(2 * jnp.pi)
+def _log_density(z: Scalar) -> Scalar:
+    return -0.5 * z**2 - 0.5 * math.log(2 * math.pi)
+
+
+def _below(z: Scalar) -> Scalar:
+    """Φ(z) for z ≤ 0."""
+    return 0.5 * erfc(-z * math.sqrt(0.5))
+
+
+def _mills(z: Scalar) -> Scalar:
+    """Φ(z)/φ(z) far out on the negative side, from its asymptotic series."""
+    return (1 - z**-2 + 3 * z**-4) / -z

@@ -45,11 +45,14 @@ class GaussianMixture:
 
     def sample(self, key: PRNGKeyArray) -> Float[Array, " d"]:
         """One draw of θ."""
-        return self.distribution().sample(seed=key)
+        pick_key, noise_key = jax.random.split(key)
+        index = jax.random.categorical(pick_key, self.log_weights)
+        noise = jax.random.normal(noise_key, self.means.shape[1:], self.means.dtype)
+        return self.means[index] + self.scale_trils[index] @ noise
 
     def log_prob(self, theta: Float[Array, " d"]) -> Scalar:
         """Normalized log density, differentiable in θ and in every leaf."""
-        return self.distribution().log_prob(theta)
+        return jnp.asarray(self.distribution().log_prob(theta))
 
     def mean(self) -> Float[Array, " d"]:
         """E θ = Σₖ αₖ μₖ."""
@@ -64,14 +67,14 @@ class GaussianMixture:
     def marginal(self, axes: tuple[int, ...]) -> GaussianMixture:
         """The law of the named axes of θ, in the order given."""
         index = jnp.array(axes)
-        return self.replace(means=self.means[:, index], scale_trils=jax.vmap(factor)(self.scale_trils[:, index]))
+        trils = jax.vmap(factor)(self.scale_trils[:, index])
+        return GaussianMixture(self.log_weights, self.means[:, index], trils)
 
     def affine(self, shift: Float[Array, " d"], scale: Float[Array, " d"]) -> GaussianMixture:
         """The law of shift + scale · z, axis by axis, where this mixture is the law of z; no scale may be zero."""
         sign = jnp.where(scale < 0, -1.0, 1.0)
-        return self.replace(
-            means=shift + scale * self.means, scale_trils=scale[:, None] * self.scale_trils * sign[None, :]
-        )
+        trils = scale[:, None] * self.scale_trils * sign[None, :]
+        return GaussianMixture(self.log_weights, shift + scale * self.means, trils)
 
 
 def moment_match(mixture: GaussianMixture) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:

@@ -29,7 +29,7 @@ def invert(lower: Float[Array, "d d"]) -> Float[Array, "d d"]:
 
 
 def log_normal(difference: Float[Array, " d"], lower: Float[Array, "d d"]) -> Scalar:
-    """log N(x; μ, L Lᵀ) for x − μ = `difference`."""
+    """Log density log N(x; μ, L Lᵀ) for x − μ = `difference`."""
     white = solve_triangular(lower, difference, lower=True)
     scale = jnp.log(jnp.diagonal(lower)).sum() + 0.5 * difference.shape[-1] * jnp.log(2 * jnp.pi)
     return -0.5 * (white**2).sum() - scale

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayessim_jax.beliefs.box_probability import box_probability, condition, lattice
 from bayessim_jax.beliefs.mixture import GaussianMixture
@@ -45,7 +45,7 @@ class Truncated:
         return jax.tree.map(lambda a, b: jnp.where(sound, a, b), whole, safe)
 
     def log_mass(self) -> Scalar:
-        """log ∫_box q(θ) dθ: how much of the mixture the box holds."""
+        """The log of ∫_box q(θ) dθ: how much of the mixture the box holds."""
         return jax.nn.logsumexp(self._log_shares())
 
     def sample(self, key: PRNGKeyArray) -> Float[Array, " d"]:
@@ -56,23 +56,16 @@ class Truncated:
 
         Source: Genz 1992
         """
-        d, dtype = self.box.size, self.box.low.dtype
-        pick_key, inner_key, flat_key, share_key = jax.random.split(key, 4)
-        index = jax.random.categorical(pick_key, self._log_shares())
+        d, low, high = self.box.size, self.box.low, self.box.high
+        draws = jax.random.uniform(key, (2 * d + 3,), low.dtype)
+        shift, flat, (which, kept, share) = draws[:d], draws[d : 2 * d], draws[2 * d :]
+        index = _pick(which, self._log_shares())
+        edge = jnp.finfo(low.dtype).eps
+        u = jnp.mod(lattice(_CANDIDATES if d > 1 else 1, d) + shift, 1.0).clip(edge, 1 - edge)
         mean, scale_tril = self.mixture.means[index], self.mixture.scale_trils[index]
-        edge = jnp.finfo(dtype).eps
-        shift, last, pick = jnp.split(jax.random.uniform(inner_key, (d + 1,), dtype), [d - 1, d])
-        u = jnp.mod(lattice(_CANDIDATES if d > 1 else 1, d - 1) + shift, 1.0).clip(edge, 1 - edge)
-        log_weights, _, _ = jax.vmap(lambda v: condition(mean, scale_tril, self.box.low, self.box.high, v))(u)
-        ladder = jnp.cumsum(jax.nn.softmax(log_weights))
-        chosen = u[jnp.minimum((ladder < pick * ladder[-1]).sum(), u.shape[0] - 1)]
-        _, _, fractions = condition(
-            mean, scale_tril, self.box.low, self.box.high, jnp.append(chosen, last.clip(edge, 1 - edge))
-        )
-        flat = jax.random.bernoulli(share_key, self.prior_share)
-        fraction = jnp.where(flat, jax.random.uniform(flat_key, (d,), dtype), jnp.stack(fractions))
-        inner_low, inner_high = jnp.nextafter(self.box.low, self.box.high), jnp.nextafter(self.box.high, self.box.low)
-        return jnp.clip(self.box.low + fraction * self.box.width, inner_low, inner_high)
+        log_weights, fractions = jax.vmap(lambda v: condition(mean, scale_tril, low, high, v))(u)
+        fraction = jnp.where(share < self.prior_share, flat, fractions[_pick(kept, log_weights)])
+        return jnp.clip(low + fraction * self.box.width, jnp.nextafter(low, high), jnp.nextafter(high, low))
 
     def log_prob(self, theta: Float[Array, " d"]) -> Scalar:
         """Normalized log density in raw units; −∞ outside the box."""
@@ -117,7 +110,7 @@ class Truncated:
         return jnp.where(inside, self._blend(-jnp.log(high[0] - low[0]), cut), -jnp.inf)
 
     def _log_shares(self) -> Float[Array, " components"]:
-        """log αₖ Zₖ, Zₖ the mass of component k in the box."""
+        """For each component the log of αₖ Zₖ, Zₖ the mass its mass in the box."""
         masses = box_probability(self.mixture.means, self.mixture.scale_trils, self.box.low, self.box.high)
         return jax.nn.log_softmax(self.mixture.log_weights) + masses
 
@@ -128,18 +121,20 @@ class Truncated:
         """Weighted points of the mixture's part; the weights sum to one."""
         u = lattice(_MOMENT_POINTS, self.box.size)
 
-        def walk(mean: Array, scale_tril: Array, v: Array) -> tuple[Scalar, Array]:
-            log_weight, _, fractions = condition(mean, scale_tril, self.box.low, self.box.high, v)
-            return log_weight, jnp.stack(fractions)
-
-        over = jax.vmap(jax.vmap(walk, (None, None, 0)), (0, 0, None))
-        log_weights, fractions = over(self.mixture.means, self.mixture.scale_trils, u)
+        over = jax.vmap(jax.vmap(condition, (None, None, None, None, 0)), (0, 0, None, None, None))
+        log_weights, fractions = over(self.mixture.means, self.mixture.scale_trils, self.box.low, self.box.high, u)
         weights = jax.nn.softmax((jax.nn.log_softmax(self.mixture.log_weights)[:, None] + log_weights).ravel())
         return weights, self.box.low + fractions.reshape(-1, self.box.size) * self.box.width
 
 
+def _pick(u: Scalar, log_weights: Float[Array, " n"]) -> Int[Array, ""]:
+    """The index below which a share u of the weights lies."""
+    ladder = jnp.cumsum(jax.nn.softmax(log_weights))
+    return jnp.minimum((ladder <= u * ladder[-1]).sum(), log_weights.size - 1)
+
+
 def _log(share: Scalar) -> Scalar:
-    """log share, −∞ at zero with a derivative of zero."""
+    """The log of a share, −∞ at zero with a derivative of zero."""
     return jnp.where(share > 0, jnp.log(jnp.where(share > 0, share, 1.0)), -jnp.inf)
 
 
