@@ -59,20 +59,19 @@ class Episodes:
         return jax.tree.map(jnp.add, self, other)
 
 
-def begin(key: PRNGKeyArray, system: System[Any], belief: Belief, batch: tuple[int, ...]) -> Worlds:
-    """Start an episode in every world: θ from the belief, a random reset, a noisy first look."""
+def begin(key: PRNGKeyArray, system: System[Any], belief: Belief, noise: Float[Array, "*batch obs"]) -> Worlds:
+    """Start an episode in every world: θ from the belief, a random reset, a first look with standard normal `noise`."""
 
-    def one(key: PRNGKeyArray) -> Worlds:
-        theta_key, reset_key, noise_key = jax.random.split(key, 3)
-        theta = belief.sample(theta_key)
-        state = system.reset(reset_key, theta)
-        observation = system.observe(theta, state)
-        observation = observation + system.noise * jax.random.normal(noise_key, observation.shape)
+    def one(keys: PRNGKeyArray, noise: Float[Array, " obs"]) -> Worlds:
+        theta = belief.sample(keys[0])
+        state = system.reset(keys[1], theta)
+        observation = system.observe(theta, state) + system.noise * noise
         return Worlds(state, theta, observation, jnp.zeros((), jnp.int32), jnp.zeros(()))
 
+    batch = noise.shape[:-1]
     for _ in batch:
         one = jax.vmap(one)
-    return one(jax.random.split(key, batch))
+    return one(jax.random.split(key, (*batch, 2)), noise)
 
 
 def collect(
@@ -81,6 +80,7 @@ def collect(
     task: Task[Any],
     belief: Belief,
     worlds: Worlds,
+    sensor: Float[Array, "steps worlds 2 obs"],
     choose: Callable[[Any, Any], tuple[Any, Any]],
     noise: Float[Array, "steps worlds noise"],
     episode_steps: int,
@@ -88,22 +88,19 @@ def collect(
     """Let `choose(observations, noise) -> (raw, actions)` act for as many steps as there is noise.
 
     Episodes end by the task, after `episode_steps` steps or where a number is not finite; the next one begins with a
-    new θ at once.
+    new θ at once. `sensor` holds standard normal numbers: for each step's observation and for a new episode's first.
     """
-    steps, count = noise.shape[:2]
-    fresh_key, sensor_key = jax.random.split(key)
-    fresh = begin(fresh_key, system, belief, (steps, count))
-    sensor = system.noise * jax.random.normal(sensor_key, fresh.observation.shape)
+    fresh = begin(key, system, belief, sensor[:, :, 1])
 
     def advance(theta: Any, state: Any, action: Any) -> Any:
         after = system.step(theta, state, action)
         return after, system.observe(theta, after), task.reward(state, action, after), task.terminated(after)
 
     def step(worlds: Worlds, x: Any) -> Any:
-        noise, sensor, fresh = x
+        noise, unit, fresh = x
         raw, action = choose(worlds.observation, noise)
         state, clean, reward, terminated = jax.vmap(advance)(worlds.theta, worlds.state, action)
-        observation = clean + sensor
+        observation = clean + system.noise * unit
         sound = jnp.isfinite(observation).all(-1) & jnp.isfinite(reward) & jnp.isfinite(raw).all(-1)
         transition = Transitions(
             observation=worlds.observation,
@@ -117,7 +114,7 @@ def collect(
         after = Worlds(state, worlds.theta, observation, worlds.age + 1, worlds.gained + transition.reward)
         return _where(transition.ended, fresh, after), (transition, after.gained, after.age)
 
-    worlds, (transitions, gained, age) = jax.lax.scan(step, worlds, (noise, sensor, fresh))
+    worlds, (transitions, gained, age) = jax.lax.scan(step, worlds, (noise, sensor[:, :, 0], fresh))
     done = (transitions.ended & transitions.sound).astype(gained.dtype)
     episodes = Episodes(jnp.sum(done * gained), jnp.sum(done * age), jnp.sum(done))
     return worlds, transitions, episodes

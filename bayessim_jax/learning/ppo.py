@@ -152,28 +152,27 @@ class Ppo:
 
     def step(self, key: PRNGKeyArray, state: PpoState, belief: Belief) -> tuple[PpoState, PpoInfo]:
         """One round: collect and improve, `iterations` times; every round begins with new episodes."""
-        begin_key, scan_key = jax.random.split(key)
-        worlds = begin(begin_key, self.system, belief, (self.envs,))
+        keys = jax.random.split(key, (self.iterations + 1, 3 + self.epochs))
+        looks = (self.envs, self.system.observations.size)
+        worlds = begin(keys[0, 0], self.system, belief, jax.random.normal(keys[0, 1], looks))
         sums = Episodes(jnp.zeros(()), jnp.zeros(()), jnp.zeros(()))
 
-        def iterate(carry: Any, key: PRNGKeyArray) -> Any:
+        def iterate(carry: Any, keys: PRNGKeyArray) -> Any:
             state, worlds, sums = carry
-            noise_key, collect_key, improve_key = jax.random.split(key, 3)
-            noise = self.head.noise(noise_key, (self.horizon, self.envs))
+            noise = self.head.noise(keys[0], (self.horizon, self.envs))
+            sensor = jax.random.normal(keys[1], (self.horizon, self.envs, 2, looks[1]))
 
             def choose(observations: Any, noise: Any) -> Any:
                 raw = jax.vmap(self.head.sample)(self._outputs(state.weights, observations), noise)
                 return raw, jax.vmap(self.head.action)(raw)
 
             worlds, transitions, episodes = collect(
-                collect_key, self.system, self.task, belief, worlds, choose, noise, self.episode_steps
+                keys[2], self.system, self.task, belief, worlds, sensor, choose, noise, self.episode_steps
             )
-            state, seen = self._improve(improve_key, state, transitions)
+            state, seen = self._improve(keys[3:], state, transitions)
             return (state, worlds, sums + episodes), (seen, jnp.sum(~transitions.sound))
 
-        (state, worlds, sums), (seen, nonfinite) = jax.lax.scan(
-            iterate, (state, worlds, sums), jax.random.split(scan_key, self.iterations)
-        )
+        (state, worlds, sums), (seen, nonfinite) = jax.lax.scan(iterate, (state, worlds, sums), keys[1:])
         none, count = sums.count == 0, jnp.maximum(sums.count, 1.0)
         value_loss, entropy, divergence, skipped = seen
         return state, PpoInfo(
@@ -193,8 +192,8 @@ class Ppo:
         values: Any = self.critic.apply(weights["value"], self.scaling.normalise(observations))
         return values[..., 0]
 
-    def _improve(self, key: PRNGKeyArray, state: PpoState, seen: Transitions) -> tuple[PpoState, Any]:
-        """`epochs` passes over the transitions in minibatches."""
+    def _improve(self, keys: PRNGKeyArray, state: PpoState, seen: Transitions) -> tuple[PpoState, Any]:
+        """One pass over the transitions in minibatches for each key."""
         weights, spread = state.weights, state.spread
         unit = jnp.where(spread > 0, spread, 1.0)
         advantage, target = advantages(
@@ -248,7 +247,7 @@ class Ppo:
             shuffled = table[jax.random.permutation(key, rows)]
             return jax.lax.scan(update, carry, shuffled.reshape(self.minibatches, -1, table.shape[1]))
 
-        (flat, moments), info = jax.lax.scan(epoch, (flat, state.moments), jax.random.split(key, self.epochs))
+        (flat, moments), info = jax.lax.scan(epoch, (flat, state.moments), keys)
         return PpoState(unravel(flat), moments, spread), info
 
 
