@@ -1,0 +1,62 @@
+"""The state of a run on disk: the last two rounds, each with the settings it belongs to."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any
+
+import jax
+import orbax.checkpoint as ocp
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+__all__ = ["Checkpoints"]
+
+
+class Checkpoints:
+    """Checkpoints of a run, by the number of rounds done; to be closed."""
+
+    def __init__(self, path: Path, keep: int = 2) -> None:
+        logging.getLogger("absl").setLevel(logging.ERROR)
+        self.path = path.absolute()
+        options = ocp.CheckpointManagerOptions(max_to_keep=keep, enable_async_checkpointing=False)
+        self.manager = ocp.CheckpointManager(self.path, options=options)
+
+    def close(self) -> None:
+        """Let go of the folder."""
+        self.manager.close()
+
+    @property
+    def latest(self) -> int | None:
+        """Rounds done at the last checkpoint, or nothing where there is none."""
+        return self.manager.latest_step()
+
+    def save(self, rounds: int, state: Any, settings: Mapping[str, Any]) -> None:
+        """Write the state; on return it is on disk, whole."""
+        self.manager.save(
+            rounds, args=ocp.args.Composite(state=ocp.args.StandardSave(state), settings=ocp.args.JsonSave(settings))
+        )
+        self.manager.wait_until_finished()
+
+    def settings(self) -> dict[str, Any]:
+        """The settings of the last checkpoint; raises `ValueError` where it is damaged."""
+        return self._restore(settings=ocp.args.JsonRestore())["settings"]
+
+    def restore(self, like: Any) -> Any:
+        """The last state, in the structure of `like`; raises `ValueError` where it is damaged or of another shape."""
+        abstract = jax.tree.map(ocp.tree.to_shape_dtype_struct, like)
+        return self._restore(state=ocp.args.StandardRestore(abstract))["state"]
+
+    def _restore(self, **items: Any) -> Any:
+        if self.latest is None:
+            raise ValueError(f"no checkpoint in {self.path}; start again with another --out.")
+        try:
+            return self.manager.restore(self.latest, args=ocp.args.Composite(**items))
+        except Exception as error:  # orbax raises whatever its storage layers raise
+            reason = next(iter(str(error).splitlines()), type(error).__name__)
+            raise ValueError(
+                f"checkpoint {self.path / str(self.latest)} is damaged ({reason[:160]}); "
+                "delete that folder to continue from the one before, or start again with another --out."
+            ) from error

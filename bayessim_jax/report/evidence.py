@@ -1,0 +1,59 @@
+"""What a report is made from: plain arrays and tables, wherever they come from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+__all__ = ["OnlineRun"]
+
+
+@dataclass(frozen=True)
+class OnlineRun:
+    """A run of the outer loop: settings, facts, the metrics lines, draws of every round, and θ* where it is known."""
+
+    settings: Mapping[str, Any]
+    facts: Mapping[str, Any]
+    lines: Sequence[Mapping[str, Any]]
+    draws: Float[np.ndarray, "round seed draw d"]
+    names: Sequence[str]
+    units: Sequence[str]
+    low: Float[np.ndarray, " d"]
+    high: Float[np.ndarray, " d"]
+    truths: Float[np.ndarray, "seed d"] | None = None
+
+    @property
+    def rounds(self) -> int:
+        """Rounds done."""
+        return self.draws.shape[0]
+
+    @property
+    def seeds(self) -> list[int]:
+        """The seeds, in the order of the arrays."""
+        return list(dict.fromkeys(line["seed"] for line in self.lines))
+
+    def series(self, name: str) -> Float[np.ndarray, "seed round"]:
+        """One number of the metrics lines; NaN where it is null or absent."""
+        place = {seed: i for i, seed in enumerate(self.seeds)}
+        values = np.full((len(place), self.rounds), np.nan)
+        for line in self.lines:
+            value = line.get(name)
+            values[place[line["seed"]], line["round"] - 1] = np.nan if value is None else float(value)
+        return values
+
+    def vectors(self, name: str) -> Float[np.ndarray, "seed round d"]:
+        """A number for each parameter, such as `mean`, `sd` or `rank_true`."""
+        each = [self._replaced(name, parameter).series(name) for parameter in self.names]
+        return np.stack(each, axis=-1)
+
+    def _replaced(self, name: str, parameter: str) -> OnlineRun:
+        lines = [{**line, name: (line.get(name) or {}).get(parameter)} for line in self.lines]
+        return OnlineRun(
+            self.settings, self.facts, lines, self.draws, self.names, self.units, self.low, self.high, self.truths
+        )
