@@ -1,8 +1,38 @@
-"""Learners improve a policy against a belief over θ."""
+"""Learners: PPO and SAC, jitted, θ redrawn from the belief at every episode; and which one a system takes."""
 
 from __future__ import annotations
 
+import difflib
+from typing import TYPE_CHECKING, Any
+
 from bayessim_jax.learning.policies import NetworkPolicy as NetworkPolicy
 from bayessim_jax.learning.ppo import Ppo as Ppo
+from bayessim_jax.learning.sac import Sac as Sac
 
-__all__ = ["NetworkPolicy", "Ppo"]
+if TYPE_CHECKING:
+    from bayessim_jax.contracts import System, Task
+
+__all__ = ["DEFAULTS", "LEARNERS", "NetworkPolicy", "Ppo", "Sac", "default_learner"]
+
+LEARNERS: dict[str, Any] = {"ppo": Ppo, "sac": Sac}
+
+DEFAULTS: dict[str, tuple[str, dict[str, Any]]] = {
+    "cartpole": ("ppo", {"episodes": 30, "episode_steps": 500}),
+    "pendulum": ("sac", {"episodes": 75, "episode_steps": 200, "entropy_target": -3.0}),
+    "acrobot": ("ppo", {"episodes": 30, "episode_steps": 500}),
+}
+"""For each registered system: its learner, and the settings that learn its task in 15,000 policy steps a round.
+
+Episodes are as long as the task's: in the 50 steps of a recording a pole never meets the end of its track and an
+acrobot never reaches its line.
+"""
+
+
+def default_learner(system_name: str, system: System[Any], task: Task[Any]) -> Ppo | Sac:
+    """The learner of a registered system, or `ValueError` with the near miss."""
+    if system_name not in DEFAULTS:
+        near = difflib.get_close_matches(system_name, DEFAULTS, n=1, cutoff=0.4)
+        hint = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(DEFAULTS)}."
+        raise ValueError(f"no learner is registered for the system {system_name!r}: {hint}")
+    learner, settings = DEFAULTS[system_name]
+    return LEARNERS[learner].create(system, task, **settings)
