@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from bayessim_jax.contracts import Recording
 
-__all__ = ["ENCODERS", "Encoder", "GatedLinear", "Lstm", "lookup_encoder", "transition_features"]
+__all__ = ["ENCODERS", "Encoder", "Lstm", "lookup_encoder", "transition_features"]
 
 
 class Encoder(Protocol):
@@ -152,67 +152,7 @@ def _lstm_backward(residuals: Any, dh: Array) -> tuple[Array, Array, None]:
 _lstm.defvjp(_lstm_forward, _lstm_backward)
 
 
-@struct.dataclass
-class GatedLinear:
-    """A gated linear recurrence over short frames: every product is outside the recurrence, so it trains fast.
-
-    `frame` successive steps are one token; each layer is
-
-        h' = a ⊙ h + (1 − a) ⊙ W_v x,   a = σ(W_a x + b),   y = x + W_o (h ⊙ swish(W_g x))
-
-    and the embedding is the state after the last token beside the mean over the tokens.
-
-    Source: Feng et al. 2024
-    """
-
-    width: int = struct.field(pytree_node=False, default=64)
-    layers: int = struct.field(pytree_node=False, default=2)
-    frame: int = struct.field(pytree_node=False, default=5)
-
-    def init(self, key: PRNGKeyArray, steps: int, features: int) -> dict[str, Any]:
-        """Glorot weights; memories that start at a spread of time scales."""
-        keys = jax.random.split(key, self.layers + 1)
-        w = self.width
-        layers = [
-            {
-                "mix": glorot(jax.random.fold_in(k, 0), w, 3 * w),
-                "out": glorot(jax.random.fold_in(k, 1), w, w),
-                "b": jnp.linspace(-1.0, 4.0, w),
-            }
-            for k in keys[1:]
-        ]
-        frame = min(self.frame, steps)
-        return {"embed": glorot(keys[0], frame * features, w), "b": jnp.zeros(w), "layers": layers}
-
-    def apply(
-        self, params: Any, x: Float[Array, "batch steps features"], valid: Bool[Array, "batch steps"]
-    ) -> Float[Array, "batch size"]:
-        """The last state beside the mean over tokens with at least one valid step."""
-        x, valid = frames(x, valid, self.frame)
-        on = valid[..., None]
-        y = jax.nn.gelu(x @ params["embed"] + params["b"])
-        for layer in params["layers"]:
-            decay, value, gate = jnp.split(y @ layer["mix"], 3, axis=-1)
-            decay = jnp.where(on, jax.nn.sigmoid(decay + layer["b"]), 1.0)
-            h = linear_scan(decay, (1 - decay) * value)
-            y = y + (h * jax.nn.swish(gate)) @ layer["out"]
-        count = jnp.maximum(on.sum(1), 1)
-        last = jnp.take_along_axis(y, (count - 1)[:, None], axis=1)[:, 0]
-        return jnp.concatenate([last, (y * on).sum(1) / count], axis=-1)
-
-
-def linear_scan(
-    decay: Float[Array, "batch steps width"], value: Float[Array, "batch steps width"]
-) -> Float[Array, "batch steps width"]:
-    """hₜ = aₜ hₜ₋₁ + vₜ from h₋₁ = 0, along the second axis."""
-
-    def combine(left: tuple[Array, Array], right: tuple[Array, Array]) -> tuple[Array, Array]:
-        return left[0] * right[0], left[1] * right[0] + right[1]
-
-    return jax.lax.associative_scan(combine, (decay, value), axis=1)[1]
-
-
-ENCODERS: dict[str, Encoder] = {"gated_linear": GatedLinear(), "lstm": Lstm()}
+ENCODERS: dict[str, Encoder] = {"framed_lstm": Lstm(size=32, frame=2), "lstm": Lstm()}
 
 
 def lookup_encoder(name: str) -> Encoder:

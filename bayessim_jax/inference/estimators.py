@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from bayessim_jax.beliefs.mixture import GaussianMixture
+from bayessim_jax.beliefs import GaussianMixture, reduce
 from bayessim_jax.contracts import Recording, Scalar
 from bayessim_jax.inference.encoders import Encoder, glorot, lookup_encoder, transition_features
-from bayessim_jax.inference.fit import FitInfo, Schedule, fit, held_out, systematic
+from bayessim_jax.inference.fit import FitInfo, Schedule, fit, systematic
 from bayessim_jax.inference.heads import MixtureHead
 from bayessim_jax.inference.summaries import FourierSummary, Summary
 
@@ -30,6 +30,7 @@ class EstimatorState:
     """Weights, and the units in which the network sees recordings and parameters."""
 
     params: Any
+    """One set of weights for each member of the ensemble (leading axis)."""
     feature_mean: Float[Array, " features"]
     feature_scale: Float[Array, " features"]
     shift: Float[Array, " d"]
@@ -47,6 +48,10 @@ class MixtureDensity:
     posterior of the whole set: evidence is combined by what was learned on simulated sets of the same size, and
     nothing is multiplied or averaged.
 
+    With few simulations a single network is over-confident. Several, each with another fold held out to stop it,
+    average to a density that is better and close to calibrated, and together they give a held-out prediction for
+    every pair.
+
     θ is standardized by the weighted mean and standard deviation of each fit's pairs; the head's last layer is
     rewritten for the new units, so warm weights keep their meaning.
     """
@@ -54,20 +59,27 @@ class MixtureDensity:
     encoder: Encoder = struct.field(pytree_node=False)
     head: MixtureHead = struct.field(pytree_node=False)
     schedule: Schedule
+    members: int = struct.field(pytree_node=False, default=4)
+    """Networks in the ensemble; the posterior is their average, merged to the head's number of components."""
+    folds: int = struct.field(pytree_node=False, default=4)
+    """Member m never trains on rows m, m + folds, m + 2 folds, …: they stop it early and judge it."""
 
     def init(self, key: PRNGKeyArray, example: Recording, d: int) -> EstimatorState:
         """Random weights for sets of recordings shaped like `example` (leading axis: the set)."""
         size, steps = example.valid.shape
         features = jax.eval_shape(jax.vmap(transition_features), example).shape[-1]
-        encoder_key, pool_key, head_key = jax.random.split(key, 3)
-        encoder = self.encoder.init(encoder_key, steps, features)
+        encoder = self.encoder.init(key, steps, features)
         x, valid = jnp.zeros((1, steps, features)), jnp.ones((1, steps), bool)
         width = jax.eval_shape(self.encoder.apply, encoder, x, valid).shape[-1]
-        params = {"encoder": encoder, "head": self.head.init(head_key, width, d)}
-        if size > 1:
-            params["gate"] = 0.1 * glorot(pool_key, width, width)
+
+        def member(key: PRNGKeyArray) -> Any:
+            encoder_key, pool_key, head_key = jax.random.split(key, 3)
+            encoder = self.encoder.init(encoder_key, steps, features)
+            params = {"encoder": encoder, "head": self.head.init(head_key, width, d)}
+            return params | ({"gate": 0.1 * glorot(pool_key, width, width)} if size > 1 else {})
+
         return EstimatorState(
-            params=params,
+            params=jax.vmap(member)(jax.random.split(key, self.members)),
             feature_mean=jnp.zeros(features),
             feature_scale=jnp.ones(features),
             shift=jnp.zeros(d),
@@ -108,7 +120,23 @@ class MixtureDensity:
         state = self._set_units(state, thetas, recordings, weights)
         z = (thetas - state.shift) / state.scale
         inputs = self._inputs(state, recordings)
-        params, info = fit(fit_key, state.params, self._log_prob, inputs, z, weights, self.schedule)
+        rows = jnp.arange(z.shape[0]) % self.folds
+
+        def member(args: Any) -> Any:
+            index, key, params = args
+            return fit(key, params, self._log_prob, inputs, z, weights, rows == index, self.schedule)
+
+        # one after the other: batched small matrix products are slower than a loop on a CPU
+        indices = jnp.arange(self.members)
+        params, infos = jax.lax.map(member, (indices, jax.random.split(fit_key, self.members), state.params))
+        info = infos.replace(
+            log_q_train=infos.log_q_train.mean(),
+            log_q_validation=infos.log_q_validation.mean(),
+            best_epoch=infos.best_epoch.max(),
+            epochs=infos.epochs.max(),
+            overfit=infos.overfit.any(),
+            nonfinite=infos.nonfinite.sum(),
+        )
         state = state.replace(params=params)
         info = self._judge(coverage_key, state, info, inputs, z, weights)
         units = jnp.log(state.scale).sum()
@@ -119,8 +147,9 @@ class MixtureDensity:
     def posterior(self, state: EstimatorState, recordings: Recording) -> GaussianMixture:
         """The mixture q(θ | recordings), for one set, in the units of θ."""
         x, valid = self._inputs(state, jax.tree.map(lambda leaf: leaf[None], recordings))
-        z = self.head.mixture(state.params["head"], self._embed(state.params, x, valid)[0])
-        return z.affine(state.shift, state.scale)
+        each = jax.vmap(lambda p: self.head.mixture(p["head"], self._embed(p, x, valid)[0]))(state.params)
+        every = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), each)
+        return reduce(every, self.head.components).affine(state.shift, state.scale)
 
     def _set_units(
         self, state: EstimatorState, thetas: Array, recordings: Recording, weights: Array
@@ -133,7 +162,7 @@ class MixtureDensity:
         shift = (weights[:, None] * thetas).sum(0) / weights.sum()
         spread = jnp.sqrt((weights[:, None] * (thetas - shift) ** 2).sum(0) / weights.sum())
         keep = lambda old, new: jnp.where(state.fitted, old, new)  # noqa: E731
-        head = self.head.change_units(
+        head = jax.vmap(self.head.change_units, (0, None, None))(
             state.params["head"], (shift - state.shift) / state.scale, spread / state.scale
         )
         head = jax.tree.map(lambda new, old: jnp.where(state.fitted, new, old), head, state.params["head"])
@@ -149,23 +178,24 @@ class MixtureDensity:
     def _judge(
         self, key: PRNGKeyArray, state: EstimatorState, info: FitInfo, inputs: Any, z: Array, weights: Array
     ) -> FitInfo:
-        """Coverage of 90 % credible sets on held-out pairs."""
-        if self.schedule.validate == 0:
-            return info
-        out = jnp.where(held_out(z.shape[0], self.schedule.validate), weights, 0.0)
-        draws = min(self.schedule.validation_draws, z.shape[0])
-        rows = systematic(key, out, draws)
-        distinct = jnp.minimum((out > 0).sum(), draws)
-        level = credible_level(
-            key,
-            jax.vmap(lambda e: self.head.mixture(state.params["head"], e))(
-                self._embed(state.params, *jax.tree.map(lambda leaf: leaf[rows], inputs))
-            ),
-            z[rows],
-        )
-        coverage = (level <= 0.9).mean()
-        chance = 3 * jnp.sqrt(0.9 * 0.1 / jnp.maximum(distinct, 1))
-        return info.replace(coverage90=coverage, overconfident=coverage < 0.9 - chance)
+        """How often the 90 % credible set of the member that held a pair out holds the truth."""
+        rows = jnp.arange(z.shape[0]) % self.folds
+        draws = self.schedule.validation_draws
+
+        def member(args: Any) -> Any:
+            index, params = args
+            shown = systematic(jax.random.fold_in(key, index), jnp.where(rows == index, weights, 0.0), draws)
+            embeddings = self._embed(params, *jax.tree.map(lambda leaf: leaf[shown], inputs))
+            return jax.vmap(lambda e: self.head.mixture(params["head"], e))(embeddings), z[shown]
+
+        each = jax.lax.map(member, (jnp.arange(self.members), state.params))
+        mixtures, truths = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), each)
+        out = jnp.where(rows < self.members, weights, 0.0)
+
+        effective = jnp.minimum(out.sum() ** 2 / jnp.maximum((out**2).sum(), 1e-12), truths.shape[0])
+        coverage = (credible_level(key, mixtures, truths) <= 0.9).mean()
+        chance = 3 * jnp.sqrt(0.9 * 0.1 / jnp.maximum(effective, 1.0))
+        return info.replace(coverage90=coverage, overconfident=coverage < 0.8 - chance)
 
 
 def credible_level(
@@ -181,14 +211,14 @@ def credible_level(
 
 
 def recurrent_mixture(
-    encoder: str | Encoder = "gated_linear", components: int = 5, schedule: Schedule | None = None
+    encoder: str | Encoder = "framed_lstm", components: int = 5, schedule: Schedule | None = None, **ensemble: int
 ) -> MixtureDensity:
     """The paper's estimator: a recurrent encoder and a mixture of Gaussians, trained jointly.
 
     Source: Possas et al. 2020
     """
     encoder = lookup_encoder(encoder) if isinstance(encoder, str) else encoder
-    return MixtureDensity(encoder, MixtureHead(components), schedule or Schedule())
+    return MixtureDensity(encoder, MixtureHead(components), schedule or Schedule(), **ensemble)
 
 
 def fourier_mixture(
