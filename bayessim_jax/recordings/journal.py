@@ -63,13 +63,19 @@ class Journal:
         if self.board is not None:
             self.board.close()
 
+    def begin(self, state: Any) -> None:
+        """Put the state before the first round on disk, so that a run can be taken up from there too."""
+        self.checkpoints.save(0, state, self.settings)
+
     def resume(self, like: Any) -> tuple[int, Any]:
         """Rounds done and the state after them; lines and draws beyond the last checkpoint are dropped."""
         state = self.checkpoints.restore(like)
         done = self.checkpoints.latest or 0
+        if done == 0:
+            return 0, state
         path, system = self.folder.path / "posterior.nc", self.system
         self.lines = self.folder.read_metrics(done)
-        self.history = read_history(path, system.parameters, system.observations, system.actions).first(done)
+        self.history = read_history(path, system.observations, system.actions).first(done)
         if len(self.lines) != done * len(self.seeds) or self.history.rounds != done:
             raise ValueError(
                 f"{self.folder.path} holds {len(self.lines)} lines of metrics and {self.history.rounds} posteriors for "

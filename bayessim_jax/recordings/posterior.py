@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-__all__ = ["read_history", "write_posterior"]
+__all__ = ["Draws", "read_draws", "read_history", "write_posterior"]
 
 ENGINE = "h5netcdf"
 
@@ -74,28 +75,59 @@ def write_posterior(
     replace_file(path, lambda temporary: tree.to_netcdf(temporary, engine=ENGINE))
 
 
-def read_history(path: Path, parameters: Box, observations: Box, actions: Box | Discrete) -> History:
+@dataclass(frozen=True)
+class Draws:
+    """The posterior of every round, as the file holds it."""
+
+    draws: Float[np.ndarray, "round seed draw d"]
+    names: list[str]
+    units: list[str]
+    low: Float[np.ndarray, " d"]
+    high: Float[np.ndarray, " d"]
+    truths: Float[np.ndarray, "seed d"] | None
+
+
+def read_draws(path: Path) -> Draws:
+    """The group `posterior_rounds`; raises `ValueError` where the file is missing or damaged."""
+    data = _read(path, "posterior_rounds")
+    variables = list(data.data_vars.values())
+    draws = np.stack([v.values[:, 0] for v in variables], axis=-1)
+    marks = [v.attrs for v in variables]
+    known = all("truth" in mark for mark in marks)
+    return Draws(
+        draws=np.moveaxis(draws, 2, 1) if "seed" in data.dims else draws[:, None],
+        names=[str(name) for name in data.data_vars],
+        units=[mark["units"] for mark in marks],
+        low=np.array([mark["prior_low"] for mark in marks]),
+        high=np.array([mark["prior_high"] for mark in marks]),
+        truths=np.stack([np.atleast_1d(mark["truth"]) for mark in marks], axis=-1) if known else None,
+    )
+
+
+def read_history(path: Path, observations: Box, actions: Box | Discrete) -> History:
     """Read back what `write_posterior` wrote; raises `ValueError` where the file is missing or damaged."""
+    seen = _read(path, "observed_data")
+    widen = lambda x: x if "seed" in seen.dims else x[:, None]  # noqa: E731
 
-    def stacked(data: xr.Dataset, box: Box | Discrete, prefix: str = "") -> np.ndarray:
-        return np.stack([data[prefix + name].values for name in box.names], axis=-1)
+    def stacked(names: Sequence[str], prefix: str = "") -> np.ndarray:
+        return widen(np.stack([seen[prefix + name].values for name in names], axis=-1))
 
+    return History(
+        draws=read_draws(path).draws,
+        times=widen(seen["time"].values),
+        observations=stacked(observations.names),
+        actions=stacked(actions.names, "action_"),
+        rewards=widen(seen["reward"].values),
+        valid=widen(seen["valid"].values.astype(bool)),
+    )
+
+
+def _read(path: Path, group: str) -> xr.Dataset:
     try:
-        with xr.open_datatree(path, engine=ENGINE) as tree:
-            seen = tree["observed_data"].to_dataset().load()
-            draws = stacked(tree["posterior_rounds"].to_dataset().load(), parameters)[:, 0]
+        with xr.open_dataset(path, group=group, engine=ENGINE) as data:
+            return data.load()
     except (OSError, KeyError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise ValueError(
             f"{path} is missing or damaged ({reason}); restore it or start again with another --out."
         ) from error
-    several = "seed" in seen.dims
-    widen = lambda x: x if several else x[:, None]  # noqa: E731
-    return History(
-        draws=np.moveaxis(draws, 2, 1) if several else draws[:, None],
-        times=widen(seen["time"].values),
-        observations=widen(stacked(seen, observations)),
-        actions=widen(stacked(seen, actions, "action_")),
-        rewards=widen(seen["reward"].values),
-        valid=widen(seen["valid"].values.astype(bool)),
-    )

@@ -36,24 +36,27 @@ class RunFolder:
 
     path: Path
 
-    @classmethod
-    def create(cls, path: Path) -> RunFolder:
-        """Make a new folder, or raise `ValueError` where something is there already or cannot be written."""
+    def check_free(self) -> None:
+        """Raise `ValueError` where something is there already."""
+        path = self.path
         try:
             if path.exists() and not path.is_dir():
                 raise ValueError(f"output folder {path} is a file; choose another --out.")
             used = path.is_dir() and any(path.iterdir())
-            if not used:
-                path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise _unwritable(path, error) from error
         if used:
-            raise ValueError(
-                f"output folder {path} is already used; continue it with --resume or choose another --out."
-            )
-        folder = cls(path)
-        folder.check_writable()
-        return folder
+            raise ValueError(f"output folder {path} is already used; continue with --resume or choose another --out.")
+
+    def create(self) -> RunFolder:
+        """Make the folder, or raise `ValueError` where something is there already or cannot be written."""
+        self.check_free()
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise _unwritable(self.path, error) from error
+        self.check_writable()
+        return self
 
     @classmethod
     def open(cls, path: Path) -> RunFolder:

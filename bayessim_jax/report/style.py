@@ -19,7 +19,7 @@ BLUE, ORANGE, PURPLE, GREY = "#3b78c3", "#e2711d", "#8a5bb5", "#8b929c"
 """Posterior and policy; truth; a second curve; prior and limits. They read on white and on black."""
 
 INK = "#0a0b0c"
-STYLE: dict[Any, Any] = {
+STYLE = {
     "font.size": 9,
     "axes.titlesize": 9,
     "axes.labelsize": 9,
@@ -48,7 +48,8 @@ PIXELS_PER_INCH = 105
 
 def draw_svg(width: float, height: float, draw: Callable[[Figure], None], name: str) -> str:
     """An `<svg>` element of the given size in inches; `name` keeps its ids apart from those of other figures."""
-    with rc_context(STYLE | {"svg.hashsalt": name}):
+    style: Any = STYLE | {"svg.hashsalt": name}
+    with rc_context(style):
         figure = Figure((width, height), layout="constrained")
         draw(figure)
         buffer = io.StringIO()

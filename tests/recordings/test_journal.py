@@ -31,7 +31,7 @@ def write(book, rounds, truths=TRUTHS):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    folder = RunFolder.create(tmp_path_factory.mktemp("runs") / "whole")
+    folder = RunFolder(tmp_path_factory.mktemp("runs") / "whole").create()
     with journal(folder) as book:
         write(book, [1, 2, 3, 4])
     return folder
@@ -80,7 +80,7 @@ def test_draws_lie_where_the_posterior_is(whole):
 
 def test_one_seed_has_no_seed_dimension_and_no_truth_where_it_is_unknown(tmp_path):
     unknown = np.full((1, 2), np.nan, np.float32)
-    folder = RunFolder.create(tmp_path / "real")
+    folder = RunFolder(tmp_path / "real").create()
     with journal(folder, [3], unknown) as book:
         write(book, [1], TRUTHS[:1])
     data = groups(folder)
@@ -88,13 +88,13 @@ def test_one_seed_has_no_seed_dimension_and_no_truth_where_it_is_unknown(tmp_pat
     assert "truth" not in data["posterior"]["length"].attrs
     assert data["observed_data"]["x"].dims == ("round", "recording", "row")
     assert folder.read_metrics()[0]["log_prob_true"] is None
-    history = read_history(folder.path / "posterior.nc", SYSTEM.parameters, SYSTEM.observations, SYSTEM.actions)
+    history = read_history(folder.path / "posterior.nc", SYSTEM.observations, SYSTEM.actions)
     assert history.observations.shape == (1, 1, 2, 6, 4)
 
 
 def test_resumed_equals_whole(whole, tmp_path):
     """Killed after the metrics of round 3 and before its checkpoint: round 3 is dropped and done again."""
-    folder = RunFolder.create(tmp_path / "cut")
+    folder = RunFolder(tmp_path / "cut").create()
     with journal(folder) as book:
         write(book, [1, 2])
     folder.write_metrics([*folder.read_metrics(), {"round": 3, "seed": 3, "log_prob_true": 99.0}])
@@ -154,7 +154,7 @@ def test_a_damaged_posterior_is_named(tmp_path):
     path = tmp_path / "posterior.nc"
     path.write_bytes(b"not netCDF")
     with pytest.raises(ValueError, match=r"posterior\.nc is missing or damaged"):
-        read_history(path, SYSTEM.parameters, SYSTEM.observations, SYSTEM.actions)
+        read_history(path, SYSTEM.observations, SYSTEM.actions)
 
 
 def test_the_tensorboard_logs_hold_the_numbers(whole):

@@ -8,7 +8,7 @@ from bayessim_jax.recordings.run_folder import RunFolder
 
 
 def test_what_is_written_is_read_back(tmp_path):
-    folder = RunFolder.create(tmp_path / "a" / "b")
+    folder = RunFolder(tmp_path / "a" / "b").create()
     settings = {"system": "cartpole", "rounds": 3, "prior": {"length": [0.1, 1.0]}, "truth": {}}
     folder.write_config(settings)
     folder.write_run({"status": "running", "truth": {"length": 0.5}})
@@ -42,16 +42,16 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_litter(tmp_path):
 def test_a_used_folder_is_refused_and_untouched(tmp_path):
     (tmp_path / "note.txt").write_text("mine")
     with pytest.raises(ValueError, match=r"already used.*--resume.*--out"):
-        RunFolder.create(tmp_path)
+        RunFolder(tmp_path).create()
     assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
 
 
 def test_an_unwritable_place_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match="is a file"):
-        RunFolder.create(tmp_path / "file")
+        RunFolder(tmp_path / "file").create()
     with pytest.raises(ValueError, match=r"cannot write.*Not a directory"):
-        RunFolder.create(tmp_path / "file" / "below")
+        RunFolder(tmp_path / "file" / "below").create()
 
 
 @pytest.mark.parametrize("name", ["config.toml", "run.json", "metrics.jsonl"])

@@ -1,0 +1,75 @@
+"""The `bayessim` command."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+from bayessim_jax import __version__
+from bayessim_jax.cli.parsing import UsageError, near_miss
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+__all__ = ["main"]
+
+HELP = """\
+usage: bayessim COMMAND [...]
+
+Bayesian inference of simulator parameters, composed with the learning of a controller.
+
+commands:
+  online SYSTEM   learn a system's parameters and its controller together (bayessim online --help)
+  report RUN      write the report of a run folder again
+  systems         what can be identified: parameters, units, priors
+
+options:
+  --help          show this message
+  --version       show the version
+  --citations     BibTeX of what this package builds on (bayessim --citations RUN: of what that run used)
+"""
+COMMANDS = ("online", "report", "systems")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; returns the exit code: 0 done, 1 the run failed, 2 bad usage, 130 interrupted."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        return _dispatch(words)
+    except UsageError as error:
+        print("bayessim: " + " ".join(str(error).split()), file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("bayessim: interrupted", file=sys.stderr)
+        return 130
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else 0
+
+
+def _dispatch(words: list[str]) -> int:
+    if not words or words[0] in ("--help", "-h", "help"):
+        print(HELP, end="", file=sys.stdout if words else sys.stderr)
+        return 0 if words else 2
+    first, rest = words[0], words[1:]
+    if first == "--version":
+        print(f"bayessim {__version__}")
+        return 0
+    if first == "--citations":
+        from bayessim_jax.cli.citations import citations
+
+        return citations(rest)
+    if first == "online":
+        from bayessim_jax.cli.online import online
+
+        return online(rest)
+    if first == "report":
+        from bayessim_jax.cli.report import report
+
+        return report(rest)
+    if first == "systems":
+        from bayessim_jax.cli.systems import systems
+
+        return systems(rest)
+    options = ("--help", "--version", "--citations")
+    kind, known = ("flag", options) if first.startswith("-") else ("command", COMMANDS)
+    raise UsageError(f"unknown {kind} {first!r}: {near_miss(first, known)}")

@@ -1,0 +1,122 @@
+"""What the commands can be told: frozen dataclasses, the only schema of flags and of `config.toml`.
+
+Nothing here imports JAX, so that help and bad usage are answered at once.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+__all__ = ["Online", "Settings"]
+
+
+def _pairs(words: list[str]) -> dict[str, float]:
+    pairs = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        try:
+            pairs[name] = float(value)
+        except ValueError:
+            equals = ""
+        if not (name and equals):
+            raise ValueError(f"{word!r} is not of the form NAME=NUMBER, such as length=0.5")
+    return pairs
+
+
+Pairs = Annotated[
+    dict[str, float],
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="NAME=NUMBER ...",
+        instance_from_str=_pairs,
+        is_instance=lambda x: isinstance(x, dict),
+        str_from_instance=lambda x: [f"{name}={value}" for name, value in x.items()],
+    ),
+]
+LEAST = {"rounds": 1, "seeds": 1, "steps": 1, "simulations": 10, "recordings": 1, "components": 1, "pool": 1}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that decides what a run computes; what `config.toml` holds."""
+
+    system: tyro.conf.Positional[Literal["cartpole", "pendulum", "acrobot"]]
+    """What to identify and control; see `bayessim systems`."""
+    target: Literal["gymnasium", "simulated"] = "gymnasium"
+    """The machine with hidden parameters: Gymnasium's environment, or this package's own system."""
+    truth: Pairs = field(default_factory=dict)
+    """True parameters to hide in the target; those not given are drawn from the prior by the seed."""
+    rounds: int = 30
+    """Rounds of the outer loop."""
+    seed: int = 0
+    """Seed of everything random; with several seeds, the first of them."""
+    seeds: int = 1
+    """Runs at once, each with its own seed and truth, to show the spread."""
+    encoder: Literal["framed_lstm", "lstm", "fourier", "summary"] = "framed_lstm"
+    """How a recording is read: a fast LSTM over short frames, the paper's LSTM, or hand-made summaries with and without random
+    Fourier features (the BayesSim RFF and epsilon-free baselines)."""
+    proposal: Literal["corrected", "paper", "truncated"] = "corrected"
+    """Where to simulate in the next round: the paper's mode, with the proposal divided out, or the truncated prior."""
+    simulations: int = 200
+    """Parameters simulated in a round."""
+    steps: int = 50
+    """Steps of a recording, real or simulated."""
+    recordings: int = 1
+    """Recordings of the target in a round; together they are one piece of evidence."""
+    evaluations: int = 1
+    """Full episodes on the target that judge the policy after each round; 0 for none."""
+    pool: int = 10
+    """Rounds whose simulations are kept for the fit."""
+    components: int = 5
+    """Gaussians in the posterior."""
+    noise: float = 0.01
+    """Standard deviation of the sensor noise, in each channel's unit."""
+    prior: tyro.conf.Suppress[dict[str, tuple[float, float]]] = field(default_factory=dict)
+    schedule: tyro.conf.Suppress[dict[str, Any]] = field(default_factory=dict)
+    learner: tyro.conf.Suppress[dict[str, Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that no run could use."""
+        for name, least in {**LEAST, "seed": 0, "evaluations": 0, "noise": 0.0}.items():
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be {least} or more.")
+        if self.seed + self.seeds > 2**32:
+            raise ValueError(f"seed is {self.seed}; it must be below {2**32 - self.seeds + 1}.")
+        for name, (low, high) in self.prior.items():
+            if not low < high:
+                raise ValueError(f"prior of {name}: low {low} must be below high {high}; swap or widen the bounds.")
+
+    def tables(self) -> dict[str, Any]:
+        """Plain tables for TOML and JSON."""
+        return {
+            key: {k: list(v) if isinstance(v, tuple) else v for k, v in value.items()}
+            if isinstance(value, dict)
+            else value
+            for key, value in dataclasses.asdict(self).items()
+        }
+
+
+@dataclass(frozen=True)
+class Online:
+    """Learn a system's parameters and its controller together, round by round, against a target that hides them."""
+
+    settings: tyro.conf.OmitArgPrefixes[Settings]
+    config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """TOML file of settings, such as the config.toml of an earlier run; flags win over it. Its tables [prior],
+    [schedule] and [learner] reach what has no flag."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Folder for the results; by default runs/SYSTEM-seedS."""
+    resume: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Continue the run in the output folder; more --rounds than before go on further."""
+    quiet: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print nothing but errors."""
+
+    @property
+    def folder(self) -> Path:
+        """Where the results go."""
+        return self.out or Path("runs") / f"{self.settings.system}-seed{self.settings.seed}"

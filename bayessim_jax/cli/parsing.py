@@ -1,0 +1,79 @@
+"""From words on the command line to a dataclass, or one line that says what is wrong."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import difflib
+import io
+import re
+from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
+
+import tyro
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+__all__ = ["UsageError", "near_miss", "parse"]
+
+C = TypeVar("C")
+BOX = str.maketrans("│╭╮╰╯─", "      ")
+
+
+class UsageError(Exception):
+    """The user has to change the command or a file; ends the program with one line and exit code 2."""
+
+
+def near_miss(word: str, known: Iterable[str]) -> str:
+    """`did you mean 'x'?`, or the choices where nothing is near."""
+    known = list(known)
+    near = difflib.get_close_matches(word, known, n=1, cutoff=0.4)
+    return f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(known)}."
+
+
+def parse(schema: type[C], words: Sequence[str], prog: str, default: C | None = None) -> C:
+    """Fill a dataclass from the command line; raises `UsageError`, and `SystemExit(0)` after printing help."""
+    flags = [*_flags(schema), "--help"]
+    for word in words:
+        flag = word.split("=")[0].replace("_", "-")
+        if flag.startswith("--") and flag not in flags:
+            raise UsageError(f"unknown flag {word.split('=')[0]!r}: {near_miss(flag, flags)}")
+    told = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(told):
+            parsed: Any = tyro.cli(schema, prog=prog, args=list(words), default=default)
+            return parsed
+    except SystemExit as stop:
+        if stop.code in (0, None):
+            raise
+    raise UsageError(_one_line(told.getvalue(), prog))
+
+
+def _flags(schema: Any) -> list[str]:
+    """Every flag of a dataclass and of the dataclasses in it."""
+    hints = get_type_hints(schema)
+    flags = []
+    for field in dataclasses.fields(schema):
+        inner = hints[field.name]
+        flags += _flags(inner) if dataclasses.is_dataclass(inner) else ["--" + field.name.replace("_", "-")]
+    return flags
+
+
+def _one_line(text: str, prog: str) -> str:
+    """The message inside the box that the parser draws, reworded where that helps."""
+    lines = [line.translate(BOX).strip() for line in text.splitlines()[1:]]
+    message = " ".join(lines[: lines.index("")] if "" in lines else lines)
+    if match := re.search(r"invalid choice '(.*)' for argument '(.*)'\. Expected one of \((.*)\)", message):
+        value, name, choices = match.groups()
+        hint = near_miss(value, re.findall(r"'(.*?)'", choices))
+        return f"unknown {name.lstrip('-').split('.')[-1]} {value!r}: {hint}"
+    if match := re.search(r"Error parsing (\S+): (.*)", message):
+        name, reason = match.groups()
+        if number := re.search(r"invalid literal for int\(\) with base 10: (.*)", reason):
+            reason = f"needs a whole number, not {number[1]}."
+        elif number := re.search(r"could not convert string to float: (.*)", reason):
+            reason = f"needs a number, not {number[1]}."
+        return f"{name} {reason}" if name.startswith("--") else reason
+    if match := re.match(r"Missing from .*?: *\{(.*?)\}", message):
+        return f"{prog} needs one of {match[1].replace(',', ', ')} after it; see {prog} --help."
+    return f"{message} (see {prog} --help)"

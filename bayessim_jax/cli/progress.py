@@ -1,0 +1,88 @@
+"""What a person sees while a run goes on: a line for each round, and on a terminal a bar beneath them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+__all__ = ["Reporter", "describe"]
+
+
+def describe(lines: Sequence[Mapping[str, Any]], left: float) -> str:
+    """One round in a line: log q(θ*) where θ* is known, return, speed, time left; means where there are seeds."""
+
+    def mean(name: str) -> float | None:
+        values = [line[name] for line in lines if line[name] is not None and line[name] == line[name]]
+        return sum(values) / len(values) if values else None
+
+    parts = []
+    if (log_prob := mean("log_prob_true")) is not None:
+        parts.append(f"log q(θ*) {log_prob:6.2f}")
+    if (returned := mean("return_target")) is not None:
+        parts.append(f"return {returned:7.1f}")
+    parts.append(f"{lines[0]['simulations_per_second']:6.0f} simulations/s")
+    parts.append(f"{_duration(left)} left")
+    marks = ("overconfident", "over-confident"), ("overfit", "over-fitted"), ("collapsed", "collapsed")
+    parts += [word for name, word in marks if any(line.get(name) for line in lines)]
+    if diverged := sum(line["diverged"] for line in lines):
+        parts.append(f"{diverged} diverged")
+    return "  ".join(parts)
+
+
+def _duration(seconds: float) -> str:
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
+
+
+class Reporter:
+    """Progress on standard error; plain lines where that is no terminal, nothing where quiet."""
+
+    def __init__(self, rounds: int, done: int = 0, quiet: bool = False) -> None:
+        self.console = Console(stderr=True, quiet=quiet, highlight=False, soft_wrap=True)
+        self.rounds, self.times = rounds, []
+        self.bar: Progress | None = None
+        if self.console.is_terminal and not quiet:
+            columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+            self.bar = Progress(*columns, console=self.console, transient=True)
+            self.task = self.bar.add_task("starting", total=rounds, completed=done)
+
+    def __enter__(self) -> Reporter:
+        if self.bar is not None:
+            self.bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.bar is not None:
+            self.bar.stop()
+
+    def say(self, text: str) -> None:
+        """Print a line."""
+        self.console.print(text, markup=False)
+
+    def stage(self, text: str) -> None:
+        """What goes on now: the words beside the bar, or a line."""
+        if self.bar is not None:
+            self.bar.update(self.task, description=text)
+        else:
+            self.say(text)
+
+    def compiled(self, seconds: float) -> None:
+        """Tell how long the compilation took."""
+        self.say(f"compiled in {seconds:.1f} s")
+        if self.bar is not None:
+            self.bar.update(self.task, description="running")
+
+    def round(self, index: int, lines: Sequence[Mapping[str, Any]], seconds: float) -> None:
+        """Tell of a round that is on disk."""
+        self.times = [*self.times[-9:], seconds]
+        left = (self.rounds - index) * sum(self.times) / len(self.times)
+        width = len(str(self.rounds))
+        self.say(f"round {index:{width}d}/{self.rounds}  {describe(lines, left)}")
+        if self.bar is not None:
+            self.bar.update(self.task, completed=index)
