@@ -19,7 +19,7 @@ def box_probability(
     scale_trils: Float[Array, "components d d"],
     low: Float[Array, " d"],
     high: Float[Array, " d"],
-    points: int = 128,
+    points: int = 256,
 ) -> Float[Array, " components"]:
     """Log P(low ≤ θ ≤ high) under each N(μₖ, Lₖ Lₖᵀ); exact for d = 1, finite however small the mass is.
 
@@ -64,15 +64,20 @@ def condition(
 
 
 def lattice(points: int, d: int) -> Float[Array, "points d"]:
-    """Richtmyer's points {i √p_j + ½} in the open unit cube, p_j the j-th prime, folded by the tent map |2x − 1|.
+    """Even points in the open unit cube: (i − ½)/N along the first axis, Richtmyer's {i √p_j + ½} along the others.
+
+    p_j is the j-th prime; the latter are folded by the tent map |2x − 1|, so that an integrand need not be periodic.
 
     Source: Genz and Bretz 2009
     """
     primes: list[int] = []
     candidate = 2
-    while len(primes) < d:
+    while len(primes) < d - 1:
         if all(candidate % p for p in primes):
             primes.append(candidate)
         candidate += 1
-    rows = [[abs(2 * math.fmod(i * math.sqrt(p) + 0.5, 1.0) - 1) for p in primes] for i in range(1, points + 1)]
-    return jnp.array(rows, dtype=float).reshape(points, d)
+    rows = [
+        [(i - 0.5) / points, *(abs(2 * math.fmod(i * math.sqrt(p) + 0.5, 1.0) - 1) for p in primes)]
+        for i in range(1, points + 1)
+    ]
+    return jnp.array(rows, dtype=float)
