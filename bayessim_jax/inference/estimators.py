@@ -10,8 +10,9 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from bayessim_jax.beliefs import GaussianMixture, reduce
-from bayessim_jax.contracts import Recording, Scalar
-from bayessim_jax.inference.encoders import Encoder, glorot, lookup_encoder, transition_features
+from bayessim_jax.contracts import Recording
+from bayessim_jax.inference.encoders import Encoder, lookup_encoder, transition_features
+from bayessim_jax.inference.evidence import Recalibration, combine_evidence, credible_level, recalibrate
 from bayessim_jax.inference.fit import FitInfo, Schedule, fit, systematic
 from bayessim_jax.inference.heads import MixtureHead
 from bayessim_jax.inference.summaries import FourierSummary, Summary
@@ -35,22 +36,20 @@ class EstimatorState:
     feature_scale: Float[Array, " features"]
     shift: Float[Array, " d"]
     scale: Float[Array, " d"]
+    recalibration: Recalibration
     fitted: Bool[Array, ""]
     """Whether the feature units are set; they are taken from the first fit and kept."""
 
 
 @struct.dataclass
 class MixtureDensity:
-    """Encoder, pooling over the recordings of a set, and mixture head, trained jointly.
+    """Encoder and mixture head, trained jointly; an ensemble of them; evidence of a set; recalibration.
 
-    A set of recordings that share θ is embedded one by one and pooled by learned weights, e = Σ gᵢ eᵢ / Σ gᵢ with
-    gᵢ = softplus(W eᵢ) channel by channel, so that an informative recording counts for more. The head then gives the
-    posterior of the whole set: evidence is combined by what was learned on simulated sets of the same size, and
-    nothing is multiplied or averaged.
-
-    With few simulations a single network is over-confident. Several, each with another fold held out to stop it,
-    average to a density that is better and close to calibrated, and together they give a held-out prediction for
-    every pair.
+    The networks learn q(θ | one recording). With few simulations a single network is over-confident: several, each with
+    another fold held out to stop it early, are averaged. The posterior of a set is the product of the evidence of its
+    recordings (`combine_evidence`). What is still wrong with it, above all the errors that the members of a set have in
+    common and that a product would multiply, is measured on simulated sets that no network was trained on, and taken
+    out (`recalibrate`).
 
     θ is standardized by the weighted mean and standard deviation of each fit's pairs; the head's last layer is
     rewritten for the new units, so warm weights keep their meaning.
@@ -60,23 +59,25 @@ class MixtureDensity:
     head: MixtureHead = struct.field(pytree_node=False)
     schedule: Schedule
     members: int = struct.field(pytree_node=False, default=4)
-    """Networks in the ensemble; the posterior is their average, merged to the head's number of components."""
-    folds: int = struct.field(pytree_node=False, default=4)
-    """Member m never trains on rows m, m + folds, m + 2 folds, …: they stop it early and judge it."""
+    """Networks in the ensemble."""
+    folds: int = struct.field(pytree_node=False, default=8)
+    """Draws of θ are dealt to folds in turn. Member m never trains on fold m, nobody trains on the last."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.members < self.folds:
+            raise ValueError(f"MixtureDensity: {self.members} members need more than {self.members} folds.")
 
     def init(self, key: PRNGKeyArray, example: Recording, d: int) -> EstimatorState:
         """Random weights for sets of recordings shaped like `example` (leading axis: the set)."""
-        size, steps = example.valid.shape
+        steps = example.valid.shape[-1]
         features = jax.eval_shape(jax.vmap(transition_features), example).shape[-1]
-        encoder = self.encoder.init(key, steps, features)
-        x, valid = jnp.zeros((1, steps, features)), jnp.ones((1, steps), bool)
-        width = jax.eval_shape(self.encoder.apply, encoder, x, valid).shape[-1]
 
-        def member(key: PRNGKeyArray) -> Any:
-            encoder_key, pool_key, head_key = jax.random.split(key, 3)
+        def member(key: PRNGKeyArray) -> dict[str, Any]:
+            encoder_key, head_key = jax.random.split(key)
             encoder = self.encoder.init(encoder_key, steps, features)
-            params = {"encoder": encoder, "head": self.head.init(head_key, width, d)}
-            return params | ({"gate": 0.1 * glorot(pool_key, width, width)} if size > 1 else {})
+            x, valid = jnp.zeros((1, steps, features)), jnp.ones((1, steps), bool)
+            width = jax.eval_shape(self.encoder.apply, encoder, x, valid).shape[-1]
+            return {"encoder": encoder, "head": self.head.init(head_key, width, d)}
 
         return EstimatorState(
             params=jax.vmap(member)(jax.random.split(key, self.members)),
@@ -84,27 +85,9 @@ class MixtureDensity:
             feature_scale=jnp.ones(features),
             shift=jnp.zeros(d),
             scale=jnp.ones(d),
+            recalibration=Recalibration(jnp.zeros(d), jnp.ones(())),
             fitted=jnp.array(False),
         )
-
-    def _embed(self, params: Any, x: Float[Array, "n set steps features"], valid: Array) -> Float[Array, "n size"]:
-        n, size = x.shape[:2]
-        flat = self.encoder.apply(
-            params["encoder"], x.reshape(n * size, *x.shape[2:]), valid.reshape(n * size, *valid.shape[2:])
-        )
-        each = flat.reshape(n, size, -1)
-        if size == 1:
-            return each[:, 0]
-        gate = jax.nn.softplus(each @ params["gate"]) * valid.any(-1)[..., None] + 1e-6
-        return (gate * each).sum(1) / gate.sum(1)
-
-    def _log_prob(self, params: Any, inputs: Any, z: Float[Array, "n d"]) -> Float[Array, " n"]:
-        return self.head.log_prob(params["head"], self._embed(params, *inputs), z)
-
-    def _inputs(self, state: EstimatorState, recordings: Recording) -> tuple[Array, Array]:
-        x = jax.vmap(jax.vmap(transition_features))(recordings)
-        x = jnp.clip((x - state.feature_mean) / state.feature_scale, -10.0, 10.0)
-        return jnp.where(recordings.valid[..., None], x, 0.0), recordings.valid
 
     def fit(
         self,
@@ -114,53 +97,85 @@ class MixtureDensity:
         recordings: Recording,
         weights: Float[Array, " n"],
     ) -> tuple[EstimatorState, FitInfo]:
-        """Continue from `state`; scores in the Info are log densities per unit of θ."""
-        fit_key, coverage_key = jax.random.split(key)
+        """Continue from `state`; scores in the Info are log densities in the units of θ, for one recording."""
+        fit_key, judge_key = jax.random.split(key)
         weights = jnp.where(recordings.diverged.any(-1), 0.0, weights)
         state = self._set_units(state, thetas, recordings, weights)
         z = (thetas - state.shift) / state.scale
         inputs = self._inputs(state, recordings)
-        rows = jnp.arange(z.shape[0]) % self.folds
+        fold = jnp.arange(z.shape[0]) % self.folds
+        size = recordings.valid.shape[1]
+        flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), inputs)
+        each_z, each_weight, each_fold = (jnp.repeat(leaf, size, axis=0) for leaf in (z, weights, fold))
 
         def member(args: Any) -> Any:
             index, key, params = args
-            return fit(key, params, self._log_prob, inputs, z, weights, rows == index, self.schedule)
+            train = jnp.where(each_fold == self.folds - 1, 0.0, each_weight)
+            return fit(key, params, self._log_prob, flat, each_z, train, each_fold == index, self.schedule)
 
         # one after the other: batched small matrix products are slower than a loop on a CPU
-        indices = jnp.arange(self.members)
-        params, infos = jax.lax.map(member, (indices, jax.random.split(fit_key, self.members), state.params))
-        info = infos.replace(
-            log_q_train=infos.log_q_train.mean(),
-            log_q_validation=infos.log_q_validation.mean(),
+        keys = jax.random.split(fit_key, self.members)
+        params, infos = jax.lax.map(member, (jnp.arange(self.members), keys, state.params))
+        state = state.replace(params=params)
+
+        rows_key, level_key = jax.random.split(judge_key)
+        spare = jnp.where(fold == self.folds - 1, weights, 0.0)
+        rows = systematic(rows_key, spare, min(self.schedule.validation_draws, z.shape[0]))
+        shown = jax.tree.map(lambda leaf: leaf[rows], inputs)
+        plain = jax.lax.map(lambda one: self._combined(params, *one), shown)
+        count = jnp.minimum(spare.sum() ** 2 / jnp.maximum((spare**2).sum(), 1e-12), rows.size)
+        recalibration = recalibrate(plain, z[rows], count)
+        level = credible_level(level_key, plain, z[rows])
+        coverage, units = (level <= 0.9).mean(), jnp.log(state.scale).sum()
+        return state.replace(recalibration=recalibration), FitInfo(
+            log_q_train=infos.log_q_train.mean() - units,
+            log_q_validation=infos.log_q_validation.mean() - units,
             best_epoch=infos.best_epoch.max(),
             epochs=infos.epochs.max(),
+            coverage90=coverage,
+            widen=recalibration.widen,
             overfit=infos.overfit.any(),
+            overconfident=coverage < 0.75 - 3 * jnp.sqrt(0.9 * 0.1 / jnp.maximum(count, 1.0)),
             nonfinite=infos.nonfinite.sum(),
-        )
-        state = state.replace(params=params)
-        info = self._judge(coverage_key, state, info, inputs, z, weights)
-        units = jnp.log(state.scale).sum()
-        return state, info.replace(
-            log_q_train=info.log_q_train - units, log_q_validation=info.log_q_validation - units
         )
 
     def posterior(self, state: EstimatorState, recordings: Recording) -> GaussianMixture:
         """The mixture q(θ | recordings), for one set, in the units of θ."""
         x, valid = self._inputs(state, jax.tree.map(lambda leaf: leaf[None], recordings))
-        each = jax.vmap(lambda p: self.head.mixture(p["head"], self._embed(p, x, valid)[0]))(state.params)
-        every = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), each)
-        return reduce(every, self.head.components).affine(state.shift, state.scale)
+        valid = valid & ~recordings.diverged[None, :, None]
+        plain = self._combined(state.params, x[0], valid[0])
+        return state.recalibration.apply(plain).affine(state.shift, state.scale)
 
-    def _set_units(
-        self, state: EstimatorState, thetas: Array, recordings: Recording, weights: Array
-    ) -> EstimatorState:
+    def _log_prob(self, params: Any, inputs: Any, z: Float[Array, "n d"]) -> Float[Array, " n"]:
+        return self.head.log_prob(params["head"], self.encoder.apply(params["encoder"], *inputs), z)
+
+    def _inputs(self, state: EstimatorState, recordings: Recording) -> tuple[Array, Array]:
+        x = jax.vmap(jax.vmap(transition_features))(recordings)
+        x = jnp.clip((x - state.feature_mean) / state.feature_scale, -10.0, 10.0)
+        return jnp.where(recordings.valid[..., None], x, 0.0), recordings.valid
+
+    def _combined(self, params: Any, x: Float[Array, "set steps features"], valid: Array) -> GaussianMixture:
+        """The ensemble's posterior of one set in standardized θ, before recalibration."""
+
+        def member(p: Any) -> GaussianMixture:
+            return jax.vmap(lambda e: self.head.mixture(p["head"], e))(self.encoder.apply(p["encoder"], x, valid))
+
+        each = jax.vmap(member, out_axes=1)(params)  # (set, members, K, …)
+        each = jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0], -1, *leaf.shape[3:]), each)
+        if x.shape[0] == 1:
+            return reduce(jax.tree.map(lambda leaf: leaf[0], each), self.head.components)
+        one = combine_evidence(each, valid.any(-1))
+        return jax.tree.map(lambda leaf: jnp.repeat(leaf, self.head.components, axis=0), one)
+
+    def _set_units(self, state: EstimatorState, thetas: Array, recordings: Recording, weights: Array) -> EstimatorState:
         x = jax.vmap(jax.vmap(transition_features))(recordings)
         w = weights[:, None, None, None] * recordings.valid[..., None]
         total = jnp.maximum(w.sum(), 1e-12)
         mean = (w * x).sum((0, 1, 2)) / total
         scale = jnp.sqrt((w * (x - mean) ** 2).sum((0, 1, 2)) / total) + 1e-6
-        shift = (weights[:, None] * thetas).sum(0) / weights.sum()
-        spread = jnp.sqrt((weights[:, None] * (thetas - shift) ** 2).sum(0) / weights.sum())
+        share = weights[:, None] / jnp.maximum(weights.sum(), 1e-12)
+        shift = (share * thetas).sum(0)
+        spread = jnp.sqrt((share * (thetas - shift) ** 2).sum(0))
         keep = lambda old, new: jnp.where(state.fitted, old, new)  # noqa: E731
         head = jax.vmap(self.head.change_units, (0, None, None))(
             state.params["head"], (shift - state.shift) / state.scale, spread / state.scale
@@ -174,40 +189,6 @@ class MixtureDensity:
             scale=spread,
             fitted=jnp.array(True),
         )
-
-    def _judge(
-        self, key: PRNGKeyArray, state: EstimatorState, info: FitInfo, inputs: Any, z: Array, weights: Array
-    ) -> FitInfo:
-        """How often the 90 % credible set of the member that held a pair out holds the truth."""
-        rows = jnp.arange(z.shape[0]) % self.folds
-        draws = self.schedule.validation_draws
-
-        def member(args: Any) -> Any:
-            index, params = args
-            shown = systematic(jax.random.fold_in(key, index), jnp.where(rows == index, weights, 0.0), draws)
-            embeddings = self._embed(params, *jax.tree.map(lambda leaf: leaf[shown], inputs))
-            return jax.vmap(lambda e: self.head.mixture(params["head"], e))(embeddings), z[shown]
-
-        each = jax.lax.map(member, (jnp.arange(self.members), state.params))
-        mixtures, truths = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), each)
-        out = jnp.where(rows < self.members, weights, 0.0)
-
-        effective = jnp.minimum(out.sum() ** 2 / jnp.maximum((out**2).sum(), 1e-12), truths.shape[0])
-        coverage = (credible_level(key, mixtures, truths) <= 0.9).mean()
-        chance = 3 * jnp.sqrt(0.9 * 0.1 / jnp.maximum(effective, 1.0))
-        return info.replace(coverage90=coverage, overconfident=coverage < 0.8 - chance)
-
-
-def credible_level(
-    key: PRNGKeyArray, mixtures: GaussianMixture, truths: Float[Array, "n d"], draws: int = 128
-) -> Float[Array, " n"]:
-    """Smallest highest-density credible level that holds the truth, estimated from draws; uniform if calibrated."""
-
-    def one(key: PRNGKeyArray, mixture: GaussianMixture, truth: Array) -> Scalar:
-        samples = jax.vmap(mixture.sample)(jax.random.split(key, draws))
-        return (jax.vmap(mixture.log_prob)(samples) > mixture.log_prob(truth)).mean()
-
-    return jax.vmap(one)(jax.random.split(key, truths.shape[0]), mixtures, truths)
 
 
 def recurrent_mixture(

@@ -37,22 +37,23 @@ class Schedule:
 
 @struct.dataclass
 class FitInfo:
-    """What a person wants to see of a fit: scores are mean log densities in the units of the fit."""
+    """What a person wants to see of a fit; scores are mean log densities."""
 
     log_q_train: Scalar
     """Mean over the last epoch before the weights that were kept."""
     log_q_validation: Scalar
-    """At the weights that were kept."""
+    """On held-out pairs, at the weights that were kept."""
     best_epoch: Int[Array, ""]
     epochs: Int[Array, ""]
     """Epochs run, at most the schedule's."""
     coverage90: Scalar
-    """Share of held-out pairs inside their own 90 % credible set; far below 0.9 means over-confident."""
+    """Share of held-out truths inside the 90 % credible set, before recalibration: far below 0.9 is over-confident."""
+    widen: Scalar
+    """Factor on the posterior's standard deviations that recalibration asked for."""
     overfit: Bool[Array, ""]
     """The validation score fell well below its best while the training score rose."""
     overconfident: Bool[Array, ""]
-    """Coverage at 90 % is below 0.8 by more than chance allows (three standard errors): single networks are a little
-    over-confident, their average is not."""
+    """Coverage at 90 % is below 0.75 by more than chance allows (three standard errors): too far off to mend."""
     nonfinite: Int[Array, ""]
     """Updates skipped because loss or gradient was not finite."""
 
@@ -101,9 +102,7 @@ def fit(
         rate = schedule.learning_rate * 0.5 * (1 + jnp.cos(jnp.pi * count / total))
         sound = jnp.isfinite(loss) & jnp.isfinite(optax.tree.norm(grads))
         direction, new_opt_state = optimizer.update(grads, opt_state, params)
-        new_params = jax.tree.map(
-            lambda p, step: p - rate * (step + schedule.weight_decay * p), params, direction
-        )
+        new_params = jax.tree.map(lambda p, step: p - rate * (step + schedule.weight_decay * p), params, direction)
         keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(sound, a, b), new, old)  # noqa: E731
         carry = (keep(new_params, params), keep(new_opt_state, opt_state), count + 1, skipped + ~sound)
         return carry, jnp.where(sound, -loss, 0.0)
@@ -137,6 +136,7 @@ def fit(
         best_epoch=best["epoch"],
         epochs=done,
         coverage90=jnp.array(jnp.nan),
+        widen=jnp.ones(()),
         overfit=(last["validation"] < best["validation"] - 0.5) & (last["train"] > best["train"]),
         overconfident=jnp.array(False),
         nonfinite=carry[3],

@@ -5,6 +5,8 @@ from __future__ import annotations
 import difflib
 from typing import TYPE_CHECKING, Any
 
+from bayessim_jax.learning.fixed import Fixed as Fixed
+from bayessim_jax.learning.fixed import RandomPolicy as RandomPolicy
 from bayessim_jax.learning.policies import NetworkPolicy as NetworkPolicy
 from bayessim_jax.learning.ppo import Ppo as Ppo
 from bayessim_jax.learning.sac import Sac as Sac
@@ -12,7 +14,16 @@ from bayessim_jax.learning.sac import Sac as Sac
 if TYPE_CHECKING:
     from bayessim_jax.contracts import System, Task
 
-__all__ = ["DEFAULTS", "LEARNERS", "NetworkPolicy", "Ppo", "Sac", "default_learner"]
+__all__ = [
+    "DEFAULTS",
+    "LEARNERS",
+    "Fixed",
+    "NetworkPolicy",
+    "Ppo",
+    "RandomPolicy",
+    "Sac",
+    "default_learner",
+]
 
 LEARNERS: dict[str, Any] = {"ppo": Ppo, "sac": Sac}
 
