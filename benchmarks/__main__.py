@@ -1,0 +1,55 @@
+"""Benchmarks against other projects: `python -m benchmarks online | estimator | scaling`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+
+def main() -> None:
+    """Read the command line and run one benchmark."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+
+    online = commands.add_parser("online", help="one round against Stable-Baselines3 and PyTorch")
+    online.add_argument("--repeats", type=int, default=3)
+    online.add_argument("--held-out", type=int, default=500)
+    online.add_argument("--ladder", type=int, nargs="+", default=[10, 20, 40, 80, 200], help="epochs of our fit to try")
+    _add_common(online)
+
+    estimator = commands.add_parser("estimator", help="the estimator alone against sbi")
+    estimator.add_argument("--repeats", type=int, default=1)
+    estimator.add_argument("--train", type=int, default=1500)
+    estimator.add_argument("--held-out", type=int, default=500)
+    estimator.add_argument("--epochs", type=int, default=50)
+    estimator.add_argument("--encoders", nargs="+", default=["framed_lstm"])
+    estimator.add_argument("--models", nargs="+", default=["mdn", "maf"], help="sbi's density estimators")
+    _add_common(estimator)
+
+    scaling = commands.add_parser("scaling", help="rollouts per second and memory against batch size")
+    scaling.add_argument("--largest", type=int, default=65_536)
+    scaling.add_argument("--repeats", type=int, default=3)
+    scaling.add_argument("--figure", type=Path, default=Path("docs/figures/scaling.svg"))
+
+    options = parser.parse_args()
+    if options.command == "online":
+        from benchmarks.online import compare_rounds
+
+        compare_rounds(options)
+    elif options.command == "estimator":
+        from benchmarks.estimator import compare_estimators
+
+        compare_estimators(options)
+    else:
+        from benchmarks.scaling import measure_scaling
+
+        measure_scaling(options)
+
+
+def _add_common(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--threads", type=int, default=0, help="PyTorch threads; 0 takes the faster of 1 and all cores")
+
+
+if __name__ == "__main__":
+    main()
