@@ -153,7 +153,7 @@ def _next(run: OnlineRun, alarmed: bool) -> list[tuple[str, str]]:
     if alarmed:
         more = 2 * int(run.settings.get("simulations", 200))
         steps.append(("Give the estimator more simulations a round:", f"bayessim online {system} --simulations {more}"))
-    if len(run.seeds) == 1:
+    if len(run.seeds) == 1 and run.truths is not None:
         steps.append(("See the spread over seeds, each with its own truth:", f"bayessim online {system} --seeds 8"))
     read = f"xarray.open_datatree({out + '/posterior.nc'!r})['posterior']"
     steps.append(("Use the posterior in Python:", f"import xarray\n{read}"))

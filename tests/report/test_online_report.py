@@ -1,0 +1,87 @@
+import re
+import shutil
+import subprocess
+
+import pytest
+
+from bayessim_jax.report.online import render
+from tests.report.made_up import made_up
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+FLAGS = [
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync", "--enable-logging=stderr",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def page():
+    return render(made_up(rounds=16))
+
+
+def test_the_page_shows_the_papers_rounds_and_needs_nothing_else(page):
+    captions = re.findall(r"<figcaption>(Round \d+)", page)
+    assert captions == ["Round 1", "Round 5", "Round 15", "Round 16", "Round 16"]
+    assert not re.search(r'(src|href)="(?!#)|url\((?!#)|<script|@import', page)
+    assert page.count('role="img"') == page.count("<figure") == 9
+
+
+def test_rounds_that_do_not_exist_are_not_shown():
+    captions = re.findall(r"<figcaption>(Round \d+)", render(made_up(rounds=3)))
+    assert captions == ["Round 1", "Round 3", "Round 3"]
+
+
+def test_text_is_escaped():
+    run = made_up(rounds=1)
+    run.settings["system"] = "<script>alert(1)</script>"
+    run.names[0] = "<b>&"
+    for line in run.lines:
+        for key in ("mean", "sd", "rank_true"):
+            line[key] = {"<b>&": 0.5, "mass": 0.3}
+    page = render(run)
+    assert "<script" not in page
+    assert "<b>" not in page
+    assert "&lt;b&gt;&amp;" in page
+
+
+def test_every_round_is_in_the_table_with_its_numbers(page):
+    rows = re.findall(r"<tr><td>(\d+)</td>", page)
+    assert rows == [str(r) for r in range(1, 17)]
+
+
+def test_what_to_do_next_follows_from_the_run():
+    done = render(made_up(rounds=3))
+    assert "bayessim online cartpole --out runs/cartpole-seed3 --resume --rounds 6" in done
+    assert "--seeds 8" in done
+    run = made_up(rounds=3, seeds=2, overfit=True)
+    run.settings["rounds"] = 30
+    cut = render(run)
+    assert "--resume</code>" in cut
+    assert "--simulations 400" in cut
+    assert "--seeds 8" not in cut
+
+
+@pytest.mark.parametrize("options", [{"known": False}, {"seeds": 9}, {"d": 4}, {"d": 1}], ids=str)
+def test_every_kind_of_run_has_a_report(options):
+    page = render(made_up(rounds=2, **options))
+    assert ("truth" in re.sub("<[^>]*>", "", page).lower()) == options.get("known", True)
+    assert ("simulation-based calibration" in page.lower()) == ("seeds" in options)
+
+
+def open_in_chromium(html, folder):
+    path = folder / "report.html"
+    path.write_text(html)
+    command = [CHROMIUM, *FLAGS, f"--user-data-dir={folder / 'profile'}", "--dump-dom", path.as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    return done.stdout, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+def test_chromium_shows_the_figures_without_errors(page, tmp_path):
+    dom, errors = open_in_chromium(page, tmp_path)
+    assert errors == []
+    assert dom.count('role="img"') == 9
+    assert "length [m]" in dom
+    # the same look finds an error where there is one: the page's policy forbids scripts
+    _, errors = open_in_chromium(page.replace("</main>", "<script>nothing()</script></main>"), tmp_path)
+    assert errors
