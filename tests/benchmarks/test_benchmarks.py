@@ -1,0 +1,44 @@
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+from bayessim_jax.inference.encoders import transition_features
+from bayessim_jax.learning.fixed import RandomPolicy
+from bayessim_jax.systems import CartPole, Pendulum
+from benchmarks.data import as_recordings, draw_recordings, stack_rows
+from benchmarks.timing import Parts, Spread
+
+
+@pytest.mark.parametrize("create", [CartPole.create, Pendulum.create])
+def test_peers_read_what_our_encoders_read(create):
+    system = create()
+    thetas, recordings = draw_recordings(jax.random.key(0), system, RandomPolicy(system.actions), 7, 11)
+    assert jax.vmap(system.parameters.contains)(thetas).all()
+    np.testing.assert_array_equal(stack_rows(recordings), jax.vmap(transition_features)(recordings))
+
+
+def test_a_peers_arrays_become_the_same_recordings():
+    system = CartPole.create()
+    _, made = draw_recordings(jax.random.key(1), system, RandomPolicy(system.actions), 3, 5)
+    valid = np.ones((3, 5), bool)
+    valid[1, 2:] = False
+    again = as_recordings(system.dt, np.asarray(made.observations), np.asarray(made.actions), valid)
+    np.testing.assert_array_equal(again.observations[0], made.observations[0])
+    np.testing.assert_allclose(again.times[2], made.times[2])
+    np.testing.assert_array_equal(again.valid, valid)
+    assert not again.observations[1, 3:].any() and not again.diverged.any()
+
+
+def test_a_spread_is_median_and_range():
+    assert str(Spread.of([3.0, 1.0, 10.0])) == "3 (1 – 10)"
+    assert Parts(1.0, 2.0, 3.5).total == 6.5
+    with pytest.raises(ValueError, match="measure at least once"):
+        Spread.of([])
+
+
+def test_an_unknown_benchmark_is_refused_in_one_line():
+    done = subprocess.run([sys.executable, "-m", "benchmarks", "onlin"], capture_output=True, text=True)
+    assert done.returncode == 2 and "invalid choice" in done.stderr and "Traceback" not in done.stderr
