@@ -10,11 +10,12 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bayessim_jax.contracts import Belief, Scalar, System, Task
+from bayessim_jax.learning.heads import draw, normal
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["Episodes", "Transitions", "Worlds", "begin", "collect"]
+__all__ = ["Episodes", "Transitions", "Worlds", "begin", "blank", "collect"]
 
 
 @struct.dataclass
@@ -59,19 +60,26 @@ class Episodes:
         return jax.tree.map(jnp.add, self, other)
 
 
-def begin(key: PRNGKeyArray, system: System[Any], belief: Belief, noise: Float[Array, "*batch obs"]) -> Worlds:
-    """Start an episode in every world: θ from the belief, a random reset, a first look with standard normal `noise`."""
+def blank(system: System[Any], belief: Belief, count: int) -> Worlds:
+    """Worlds in which no episode has begun; `collect` begins one in each at its first step."""
+    look = jax.ShapeDtypeStruct((count, system.observations.size), system.noise.dtype)
+    shapes = jax.eval_shape(lambda key, look: begin(key, system, belief, look), jax.random.key(0), look)
+    zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+    return Worlds(zeros.state, zeros.theta, zeros.observation, zeros.age - 1, zeros.gained)
 
-    def one(keys: PRNGKeyArray, noise: Float[Array, " obs"]) -> Worlds:
+
+def begin(key: PRNGKeyArray, system: System[Any], belief: Belief, looks: Float[Array, "*batch obs"]) -> Worlds:
+    """Start an episode in every world: θ from the belief, a random reset, a first look with that much noise."""
+
+    def one(keys: PRNGKeyArray, look: Float[Array, " obs"]) -> Worlds:
         theta = belief.sample(keys[0])
         state = system.reset(keys[1], theta)
-        observation = system.observe(theta, state) + system.noise * noise
+        observation = system.observe(theta, state) + system.noise * look
         return Worlds(state, theta, observation, jnp.zeros((), jnp.int32), jnp.zeros(()))
 
-    batch = noise.shape[:-1]
-    for _ in batch:
-        one = jax.vmap(one)
-    return one(jax.random.split(key, (*batch, 2)), noise)
+    rows = looks.reshape(-1, looks.shape[-1])
+    worlds = jax.vmap(one)(jax.random.split(key, 2 * len(rows)).reshape(-1, 2), rows)
+    return jax.tree.map(lambda x: x.reshape(*looks.shape[:-1], *x.shape[1:]), worlds)
 
 
 def collect(
@@ -80,27 +88,33 @@ def collect(
     task: Task[Any],
     belief: Belief,
     worlds: Worlds,
-    sensor: Float[Array, "steps worlds 2 obs"],
     choose: Callable[[Any, Any], tuple[Any, Any]],
-    noise: Float[Array, "steps worlds noise"],
+    chance: int,
+    steps: int,
     episode_steps: int,
 ) -> tuple[Worlds, Transitions, Episodes]:
-    """Let `choose(observations, noise) -> (raw, actions)` act for as many steps as there is noise.
+    """Let `choose(observations, uniforms) -> (raw, actions)` act; it gets `chance` uniform numbers for each world.
 
     Episodes end by the task, after `episode_steps` steps or where a number is not finite; the next one begins with a
-    new θ at once. `sensor` holds standard normal numbers: for each step's observation and for a new episode's first.
+    new θ at once.
     """
-    fresh = begin(key, system, belief, sensor[:, :, 1])
+    count, obs = worlds.observation.shape
+    fresh_key, chance_key = jax.random.split(key)
+    uniforms = draw(chance_key, (steps + 1, count, chance + 2 * obs))
+    looks = normal(uniforms[..., chance:])
+    fresh = begin(fresh_key, system, belief, looks[..., :obs])
+    first, fresh = jax.tree.map(lambda x: x[0], fresh), jax.tree.map(lambda x: x[1:], fresh)
+    worlds = _where(worlds.age < 0, first, worlds)
 
     def advance(theta: Any, state: Any, action: Any) -> Any:
         after = system.step(theta, state, action)
         return after, system.observe(theta, after), task.reward(state, action, after), task.terminated(after)
 
     def step(worlds: Worlds, x: Any) -> Any:
-        noise, unit, fresh = x
-        raw, action = choose(worlds.observation, noise)
+        uniform, look, fresh = x
+        raw, action = choose(worlds.observation, uniform)
         state, clean, reward, terminated = jax.vmap(advance)(worlds.theta, worlds.state, action)
-        observation = clean + system.noise * unit
+        observation = clean + system.noise * look
         sound = jnp.isfinite(observation).all(-1) & jnp.isfinite(reward) & jnp.isfinite(raw).all(-1)
         transition = Transitions(
             observation=worlds.observation,
@@ -114,7 +128,9 @@ def collect(
         after = Worlds(state, worlds.theta, observation, worlds.age + 1, worlds.gained + transition.reward)
         return _where(transition.ended, fresh, after), (transition, after.gained, after.age)
 
-    worlds, (transitions, gained, age) = jax.lax.scan(step, worlds, (noise, sensor[:, :, 0], fresh))
+    worlds, (transitions, gained, age) = jax.lax.scan(
+        step, worlds, (uniforms[1:, :, :chance], looks[1:, :, obs:], fresh)
+    )
     done = (transitions.ended & transitions.sound).astype(gained.dtype)
     episodes = Episodes(jnp.sum(done * gained), jnp.sum(done * age), jnp.sum(done))
     return worlds, transitions, episodes

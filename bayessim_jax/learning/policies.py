@@ -7,7 +7,7 @@ from typing import Any
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from bayessim_jax.learning.heads import Head
+from bayessim_jax.learning.heads import Head, draw
 from bayessim_jax.learning.networks import Mlp
 from bayessim_jax.learning.normalisation import Scaling
 
@@ -33,5 +33,6 @@ class NetworkPolicy:
     ) -> tuple[Float[Array, " act"], tuple[()]]:
         """Choose an action for a noisy observation."""
         outputs: Any = self.network.apply(self.weights, self.scaling.normalise(observation))
-        raw = self.head.mode(outputs) if self.deterministic else self.head.sample(outputs, self.head.noise(key, ()))
-        return self.head.action(raw), memory
+        if self.deterministic:
+            return self.head.action(self.head.mode(outputs)), memory
+        return self.head.action(self.head.sample(outputs, draw(key, (self.head.chance,)))), memory

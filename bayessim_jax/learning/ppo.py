@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayessim_jax.contracts import Belief, Scalar, System, Task
-from bayessim_jax.learning.collect import Episodes, Transitions, begin, collect
+from bayessim_jax.learning.collect import Episodes, Transitions, blank, collect
 from bayessim_jax.learning.heads import Head, choose_head
 from bayessim_jax.learning.networks import Mlp
 from bayessim_jax.learning.normalisation import Scaling
@@ -152,27 +152,33 @@ class Ppo:
 
     def step(self, key: PRNGKeyArray, state: PpoState, belief: Belief) -> tuple[PpoState, PpoInfo]:
         """One round: collect and improve, `iterations` times; every round begins with new episodes."""
-        keys = jax.random.split(key, (self.iterations + 1, 3 + self.epochs))
-        looks = (self.envs, self.system.observations.size)
-        worlds = begin(keys[0, 0], self.system, belief, jax.random.normal(keys[0, 1], looks))
+        worlds = blank(self.system, belief, self.envs)
         sums = Episodes(jnp.zeros(()), jnp.zeros(()), jnp.zeros(()))
 
         def iterate(carry: Any, keys: PRNGKeyArray) -> Any:
             state, worlds, sums = carry
-            noise = self.head.noise(keys[0], (self.horizon, self.envs))
-            sensor = jax.random.normal(keys[1], (self.horizon, self.envs, 2, looks[1]))
 
-            def choose(observations: Any, noise: Any) -> Any:
-                raw = jax.vmap(self.head.sample)(self._outputs(state.weights, observations), noise)
+            def choose(observations: Any, uniforms: Any) -> Any:
+                raw = jax.vmap(self.head.sample)(self._outputs(state.weights, observations), uniforms)
                 return raw, jax.vmap(self.head.action)(raw)
 
             worlds, transitions, episodes = collect(
-                keys[2], self.system, self.task, belief, worlds, sensor, choose, noise, self.episode_steps
+                keys[0],
+                self.system,
+                self.task,
+                belief,
+                worlds,
+                choose,
+                self.head.chance,
+                self.horizon,
+                self.episode_steps,
             )
-            state, seen = self._improve(keys[3:], state, transitions)
+            state, seen = self._improve(keys[1], state, transitions)
             return (state, worlds, sums + episodes), (seen, jnp.sum(~transitions.sound))
 
-        (state, worlds, sums), (seen, nonfinite) = jax.lax.scan(iterate, (state, worlds, sums), keys[1:])
+        (state, worlds, sums), (seen, nonfinite) = jax.lax.scan(
+            iterate, (state, worlds, sums), jax.random.split(key, (self.iterations, 2))
+        )
         none, count = sums.count == 0, jnp.maximum(sums.count, 1.0)
         value_loss, entropy, divergence, skipped = seen
         return state, PpoInfo(
@@ -192,8 +198,8 @@ class Ppo:
         values: Any = self.critic.apply(weights["value"], self.scaling.normalise(observations))
         return values[..., 0]
 
-    def _improve(self, keys: PRNGKeyArray, state: PpoState, seen: Transitions) -> tuple[PpoState, Any]:
-        """One pass over the transitions in minibatches for each key."""
+    def _improve(self, key: PRNGKeyArray, state: PpoState, seen: Transitions) -> tuple[PpoState, Any]:
+        """`epochs` passes over the transitions in minibatches."""
         weights, spread = state.weights, state.spread
         unit = jnp.where(spread > 0, spread, 1.0)
         advantage, target = advantages(
@@ -205,7 +211,8 @@ class Ppo:
         )
         sound = seen.sound.astype(target.dtype)
         size = jnp.sqrt(jnp.sum(sound * target**2) / jnp.maximum(jnp.sum(sound), 1.0) + 1e-8)
-        spread = jnp.where(spread > 0, 0.9 * spread + 0.1 * size, size)
+        later = jnp.where(spread > 0, 0.9 * spread + 0.1 * size, size)
+        spread = jnp.where(jnp.isfinite(later), later, unit)
         outputs = self._outputs(weights, seen.observation)
         log_prob = jax.vmap(jax.vmap(self.head.log_prob))(outputs, seen.raw)
         columns = (seen.observation, seen.raw, log_prob, advantage, target / spread, sound)
@@ -243,11 +250,13 @@ class Ppo:
             carry = jax.tree.map(lambda new, old: jnp.where(taken, new, old), kept, carry)
             return carry, (*(jnp.where(taken, x, 0.0) for x in seen), ~taken)
 
-        def epoch(carry: Any, key: PRNGKeyArray) -> Any:
-            shuffled = table[jax.random.permutation(key, rows)]
+        def epoch(carry: Any, bits: Any) -> Any:
+            shuffled = table[jnp.argsort(bits)]
             return jax.lax.scan(update, carry, shuffled.reshape(self.minibatches, -1, table.shape[1]))
 
-        (flat, moments), info = jax.lax.scan(epoch, (flat, state.moments), keys)
+        (flat, moments), info = jax.lax.scan(
+            epoch, (flat, state.moments), jax.random.bits(key, (self.epochs * rows,)).reshape(self.epochs, rows)
+        )
         return PpoState(unravel(flat), moments, spread), info
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -37,4 +39,5 @@ class Replay:
 
     def sample(self, key: PRNGKeyArray, batch: tuple[int, ...]) -> Float[Array, "*batch width"]:
         """Rows drawn evenly, with replacement, from those that hold data."""
-        return self.table[jax.random.randint(key, batch, 0, jnp.maximum(self.filled, 1))]
+        rows = jax.random.randint(key, (math.prod(batch),), 0, jnp.maximum(self.filled, 1))
+        return self.table[rows].reshape(*batch, -1)

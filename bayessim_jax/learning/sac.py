@@ -13,8 +13,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Int, PRNGKeyArray
 
 from bayessim_jax.contracts import Belief, Box, Scalar, System, Task
-from bayessim_jax.learning.collect import Episodes, begin, collect
-from bayessim_jax.learning.heads import SquashedGaussian
+from bayessim_jax.learning.collect import Episodes, blank, collect
+from bayessim_jax.learning.heads import SquashedGaussian, draw
 from bayessim_jax.learning.networks import Mlp
 from bayessim_jax.learning.normalisation import Scaling
 from bayessim_jax.learning.policies import NetworkPolicy
@@ -160,22 +160,26 @@ class Sac:
 
     def step(self, key: PRNGKeyArray, state: SacState, belief: Belief) -> tuple[SacState, SacInfo]:
         """One round: collect and improve, `iterations` times; every round begins with new episodes."""
-        keys = jax.random.split(key, (self.iterations + 1, 5))
-        looks = (self.envs, self.system.observations.size)
-        worlds = begin(keys[0, 0], self.system, belief, jax.random.normal(keys[0, 1], looks))
+        worlds = blank(self.system, belief, self.envs)
         sums = Episodes(jnp.zeros(()), jnp.zeros(()), jnp.zeros(()))
 
         def iterate(carry: Any, keys: PRNGKeyArray) -> Any:
             state, worlds, sums = carry
-            noise = self.head.noise(keys[0], (self.horizon, self.envs))
-            sensor = jax.random.normal(keys[1], (self.horizon, self.envs, 2, looks[1]))
 
-            def choose(observations: Any, noise: Any) -> Any:
-                raw = jax.vmap(self.head.sample)(self._outputs(state.weights["policy"], observations), noise)
+            def choose(observations: Any, uniforms: Any) -> Any:
+                raw = jax.vmap(self.head.sample)(self._outputs(state.weights["policy"], observations), uniforms)
                 return raw, jax.vmap(self.head.action)(raw)
 
             worlds, seen, episodes = collect(
-                keys[2], self.system, self.task, belief, worlds, sensor, choose, noise, self.episode_steps
+                keys[0],
+                self.system,
+                self.task,
+                belief,
+                worlds,
+                choose,
+                self.head.chance,
+                self.horizon,
+                self.episode_steps,
             )
             columns = (
                 self.scaling.normalise(seen.observation),
@@ -187,11 +191,14 @@ class Sac:
             )
             rows = jnp.concatenate([c.reshape(self.horizon * self.envs, -1) for c in columns], 1)
             size = jnp.sqrt(jnp.sum(seen.reward**2) / jnp.maximum(jnp.sum(seen.sound), 1) + 1e-8)
+            size = jnp.where(jnp.isfinite(size), size, 1.0)
             state = state.replace(replay=state.replay.add(rows), spread=jnp.maximum(state.spread, size))
-            state, info = self._improve(keys[3], state)
+            state, info = self._improve(keys[1], state)
             return (state, worlds, sums + episodes), (info, jnp.sum(~seen.sound))
 
-        (state, worlds, sums), (info, nonfinite) = jax.lax.scan(iterate, (state, worlds, sums), keys[1:])
+        (state, worlds, sums), (info, nonfinite) = jax.lax.scan(
+            iterate, (state, worlds, sums), jax.random.split(key, (self.iterations, 2))
+        )
         none, count = sums.count == 0, jnp.maximum(sums.count, 1.0)
         value_loss, entropy, skipped = info
         return state, SacInfo(
@@ -207,10 +214,10 @@ class Sac:
     def _outputs(self, weights: Any, observations: Any) -> Any:
         return self.network.apply(weights, self.scaling.normalise(observations))
 
-    def _act(self, weights: Any, seen: Any, noise: Any) -> Any:
+    def _act(self, weights: Any, seen: Any, uniform: Any) -> Any:
         """Squashed actions and their log density, for normalised observations."""
         outputs: Any = self.network.apply(weights, seen)
-        raw = jax.vmap(self.head.sample)(outputs, noise)
+        raw = jax.vmap(self.head.sample)(outputs, uniform)
         return jnp.tanh(raw), jax.vmap(self.head.log_prob)(outputs, raw)
 
     def _values(self, critics: Any, seen: Any, action: Any) -> Any:
@@ -223,11 +230,11 @@ class Sac:
         obs, act = self.system.observations.size, self.head.box.size
         flat, unravel = ravel_pytree(state.weights)
         _, unravel_slow = ravel_pytree(state.weights["critics"])
-        sample_key, noise_key = jax.random.split(key)
+        sample_key, chance_key = jax.random.split(key)
         batches = state.replay.sample(sample_key, (self.updates, self.batch))
-        noises = self.head.noise(noise_key, (self.updates, 2, self.batch))
+        chances = draw(chance_key, (self.updates, 2, self.batch, self.head.chance))
 
-        def loss(flat: Any, slow: Any, batch: Any, noise: Any) -> Any:
+        def loss(flat: Any, slow: Any, batch: Any, chance: Any) -> Any:
             weights, frozen = unravel(flat), unravel(jax.lax.stop_gradient(flat))
             seen, action = batch[:, :obs], batch[:, obs : obs + act]
             after, rest = batch[:, obs + act : 2 * obs + act], batch[:, 2 * obs + act :]
@@ -235,13 +242,13 @@ class Sac:
             mean = lambda x: jnp.sum(sound * x) / jnp.maximum(jnp.sum(sound), 1.0)  # noqa: E731
             temperature = jnp.exp(frozen["log_temperature"])
 
-            next_action, next_log_prob = self._act(frozen["policy"], after, noise[0])
+            next_action, next_log_prob = self._act(frozen["policy"], after, chance[0])
             ahead = jnp.min(self._values(unravel_slow(slow), after, next_action), -1) - temperature * next_log_prob
             target = reward + self.gamma * (1.0 - terminated) * ahead
             error = self._values(weights["critics"], seen, action) - target[:, None]
             value_loss = mean(jnp.sum(error**2, -1)) / 2
 
-            chosen, log_prob = self._act(weights["policy"], seen, noise[1])
+            chosen, log_prob = self._act(weights["policy"], seen, chance[1])
             policy_loss = mean(temperature * log_prob - jnp.min(self._values(frozen["critics"], seen, chosen), -1))
             surplus = jax.lax.stop_gradient(mean(log_prob)) + self.entropy_target
             total = value_loss + policy_loss - weights["log_temperature"] * surplus
@@ -258,5 +265,5 @@ class Sac:
             carry = jax.tree.map(lambda a, b: jnp.where(taken, a, b), (moved, followed, after), carry)
             return carry, (*(jnp.where(taken, x, 0.0) for x in info), ~taken)
 
-        (flat, slow, moments), info = jax.lax.scan(update, (flat, state.slow, state.moments), (batches, noises))
+        (flat, slow, moments), info = jax.lax.scan(update, (flat, state.slow, state.moments), (batches, chances))
         return SacState(unravel(flat), slow, moments, state.replay, state.spread), info
