@@ -14,7 +14,7 @@ from bayessim_jax.contracts import Box, Scalar
 
 __all__ = ["Truncated"]
 
-_CANDIDATES = 16
+_CANDIDATES = 32
 _MOMENT_POINTS = 1024
 
 
@@ -51,7 +51,7 @@ class Truncated:
     def sample(self, key: PRNGKeyArray) -> Float[Array, " d"]:
         """One draw of θ, strictly inside the box and without atoms on its bounds.
 
-        A component is chosen by αₖ Zₖ, then θ is drawn axis by axis from the conditionals cut to the box; one of 16
+        A component is chosen by αₖ Zₖ, then θ is drawn axis by axis from the conditionals cut to the box; one of 32
         candidates on a randomly shifted lattice is kept by its weight, which corrects the order of the axes.
 
         Source: Genz 1992

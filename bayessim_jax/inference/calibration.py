@@ -41,8 +41,6 @@ def uniformity_test(
 
     Bins hold as many of the draws + 1 ranks as they can evenly; where that is uneven, `expected` is too. Good: p above
     0.01. NaN: a rank is NaN.
-
-    Source: Pearson 1900
     """
     if not 2 <= bins <= draws + 1:
         raise ValueError(f"uniformity_test: bins is {bins}; choose 2 to draws + 1 = {draws + 1}.")
