@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING
 
 from bayessim_jax.cli.parsing import UsageError
@@ -21,6 +22,7 @@ def online(words: Sequence[str]) -> int:
     try:
         if not command.resume:
             folder.check_free()
+        os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA's remarks on slow compilation
         from bayessim_jax.cli.cache import use_compilation_cache
         from bayessim_jax.cli.plan import make_plan
         from bayessim_jax.cli.session import Session

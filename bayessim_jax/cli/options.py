@@ -58,8 +58,8 @@ class Settings:
     seeds: int = 1
     """Runs at once, each with its own seed and truth, to show the spread."""
     encoder: Literal["framed_lstm", "lstm", "fourier", "summary"] = "framed_lstm"
-    """How a recording is read: a fast LSTM over short frames, the paper's LSTM, or hand-made summaries with and without random
-    Fourier features (the BayesSim RFF and epsilon-free baselines)."""
+    """How a recording is read: a fast LSTM over short frames, the paper's LSTM, or hand-made summaries with and
+    without random Fourier features (the BayesSim RFF and epsilon-free baselines)."""
     proposal: Literal["corrected", "paper", "truncated"] = "corrected"
     """Where to simulate in the next round: the paper's mode, with the proposal divided out, or the truncated prior."""
     simulations: int = 200

@@ -33,9 +33,12 @@ def near_miss(word: str, known: Iterable[str]) -> str:
 
 def parse(schema: type[C], words: Sequence[str], prog: str, default: C | None = None) -> C:
     """Fill a dataclass from the command line; raises `UsageError`, and `SystemExit(0)` after printing help."""
-    flags = [*_flags(schema), "--help"]
+    flags, hidden = _flags(schema)
+    flags += ["--help"]
     for word in words:
         flag = word.split("=")[0].replace("_", "-")
+        if flag in hidden:
+            raise UsageError(f"{flag} has no flag; set it in a table [{flag[2:]}] of a file for --config.")
         if flag.startswith("--") and flag not in flags:
             raise UsageError(f"unknown flag {word.split('=')[0]!r}: {near_miss(flag, flags)}")
     told = io.StringIO()
@@ -49,14 +52,18 @@ def parse(schema: type[C], words: Sequence[str], prog: str, default: C | None = 
     raise UsageError(_one_line(told.getvalue(), prog))
 
 
-def _flags(schema: Any) -> list[str]:
-    """Every flag of a dataclass and of the dataclasses in it."""
-    hints = get_type_hints(schema)
-    flags = []
+def _flags(schema: Any) -> tuple[list[str], list[str]]:
+    """Every flag of a dataclass and of the dataclasses in it, and the fields that have none."""
+    hints, marked = get_type_hints(schema), get_type_hints(schema, include_extras=True)
+    flags, hidden = [], []
     for field in dataclasses.fields(schema):
-        inner = hints[field.name]
-        flags += _flags(inner) if dataclasses.is_dataclass(inner) else ["--" + field.name.replace("_", "-")]
-    return flags
+        if dataclasses.is_dataclass(hints[field.name]):
+            inner_flags, inner_hidden = _flags(hints[field.name])
+            flags, hidden = flags + inner_flags, hidden + inner_hidden
+        else:
+            suppressed = tyro.conf.Suppress in getattr(marked[field.name], "__metadata__", ())
+            (hidden if suppressed else flags).append("--" + field.name.replace("_", "-"))
+    return flags, hidden
 
 
 def _one_line(text: str, prog: str) -> str:

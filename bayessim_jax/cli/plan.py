@@ -49,19 +49,39 @@ class Plan:
         first = lambda key: online.init(jax.random.split(key, 4)[0], self.setup)  # noqa: E731
         return jax.jit(_over_seeds(first, len(self.seeds)))(self.keys)
 
-    def compile(self, state: online.State) -> Callable[[online.State], tuple[online.State, online.RoundInfo]]:
-        """One round of all seeds as a compiled function of their states."""
+    def compile(self, states: online.State) -> Callable[[online.State], tuple[online.State, online.RoundInfo]]:
+        """One round of all seeds as compiled functions of their states, the same round that `online.run` does.
 
-        def one(setup: online.Setup, key: Any, theta: Any, state: online.State) -> Any:
-            state, infos = online.run(key, setup, self.target.replace(theta=theta), state, rounds=1)
-            return state, jax.tree.map(lambda leaf: leaf[0], infos)
+        What calls the target on the host is apart from what only computes, because programs with callbacks are not
+        kept by the persistent compilation cache.
+        """
+        setup, keys, thetas = self.setup, self.keys, jax.numpy.asarray(self.truths)
+        aim = lambda theta: self.target.replace(theta=theta)  # noqa: E731
+        part = lambda key, i: jax.random.split(key, 4)[i]  # noqa: E731
 
-        def every(setup: online.Setup, keys: Any, thetas: Any, states: online.State) -> Any:
-            return _over_seeds(lambda *each: one(setup, *each), len(self.seeds))(keys, thetas, states)
+        def record(setup: online.Setup, keys: Any, thetas: Any, states: Any) -> Any:
+            one = lambda k, theta, state: online.record(part(k, 1), setup, aim(theta), state)  # noqa: E731
+            return _over_seeds(one, len(self.seeds))(keys, thetas, states)
 
-        fixed = (self.setup, self.keys, jax.numpy.asarray(self.truths))
-        compiled = jax.jit(every).lower(*fixed, state).compile()
-        return lambda state: compiled(*fixed, state)
+        def update(setup: online.Setup, keys: Any, states: Any, recordings: Any) -> Any:
+            one = lambda k, state, seen: online.update(part(k, 2), setup, state, seen)  # noqa: E731
+            return _over_seeds(one, len(self.seeds))(keys, states, recordings)
+
+        def evaluate(setup: online.Setup, keys: Any, thetas: Any, states: Any) -> Any:
+            one = lambda k, theta, state: online.evaluate(part(k, 3), setup, aim(theta), state)  # noqa: E731
+            return _over_seeds(one, len(self.seeds))(keys, thetas, states)
+
+        seen = jax.eval_shape(record, setup, keys, thetas, states)
+        recorder = jax.jit(record).lower(setup, keys, thetas, states).compile()
+        updater = jax.jit(update).lower(setup, keys, states, seen).compile()
+        evaluator = jax.jit(evaluate).lower(setup, keys, thetas, states).compile()
+
+        def advance(states: online.State) -> tuple[online.State, online.RoundInfo]:
+            recordings = recorder(setup, keys, thetas, states)
+            states, infos = updater(setup, keys, states, recordings)
+            return states, infos.replace(return_target=evaluator(setup, keys, thetas, states))
+
+        return advance
 
     def sources(self) -> list[str]:
         """What the run builds on, as authors and year."""

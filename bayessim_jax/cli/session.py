@@ -83,6 +83,8 @@ class Session:
 
     def _rounds(self, facts: dict[str, Any], reporter: Reporter, interruption: Interruption, journal: Journal) -> int:
         rounds, started = self.plan.settings.rounds, time.perf_counter()
+        if self.resume:
+            self._refuse_another(journal)
         reporter.stage("compiling; this is quick the next time")
         state, done = self.plan.start(), 0
         if self.resume:
@@ -110,18 +112,24 @@ class Session:
             return interruption.code or 1
         return 0
 
-    def _take_up(self, journal: Journal, state: Any) -> tuple[int, Any]:
-        """Rounds done and the state after them, from a checkpoint of this very configuration."""
+    def _refuse_another(self, journal: Journal) -> None:
+        """Raise `UsageError` unless the checkpoint is there, belongs to this configuration and lacks rounds."""
+        where = f"the checkpoint in {journal.checkpoints.path}"
         try:
-            saved = journal.checkpoints.settings()
-            where = f"the checkpoint in {journal.checkpoints.path}"
-            refuse_differences(Settings(**settings_from(saved, where)), self.plan.settings, where, "config.toml")
-            done, state = journal.resume(state)
+            saved = Settings(**settings_from(journal.checkpoints.settings(), where))
         except (ValueError, TypeError) as error:
             raise UsageError(str(error)) from error
-        if done > self.plan.settings.rounds:
-            raise UsageError(f"rounds is {self.plan.settings.rounds}, but {done} are done; give {done} or more.")
-        return done, state
+        refuse_differences(saved, self.plan.settings, where, "config.toml")
+        done, rounds = journal.checkpoints.latest or 0, self.plan.settings.rounds
+        if done > rounds:
+            raise UsageError(f"rounds is {rounds}, but {done} are done; give {done} or more.")
+
+    def _take_up(self, journal: Journal, state: Any) -> tuple[int, Any]:
+        """Rounds done and the state after them."""
+        try:
+            return journal.resume(state)
+        except ValueError as error:
+            raise UsageError(str(error)) from error
 
     def _opening(self, before: dict[str, Any]) -> dict[str, Any]:
         device, plan, now = jax.devices()[0], self.plan, _now()

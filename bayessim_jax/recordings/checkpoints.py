@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import logging
+import warnings
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -56,7 +58,10 @@ class Checkpoints:
             return self.manager.restore(self.latest, args=ocp.args.Composite(**items))
         except Exception as error:  # orbax raises whatever its storage layers raise
             reason = next(iter(str(error).splitlines()), type(error).__name__)
-            raise ValueError(
-                f"checkpoint {self.path / str(self.latest)} is damaged ({reason[:160]}); "
-                "delete that folder to continue from the one before, or start again with another --out."
-            ) from error
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of the reads that were not come to
+            gc.collect()
+        raise ValueError(
+            f"checkpoint {self.path / str(self.latest)} is damaged ({reason[:160]}); "
+            "delete that folder to continue from the one before, or start again with another --out."
+        )
