@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from benchmarks.timing import CLOCKS, choose_clock
+
 
 def main() -> None:
     """Read the command line and run one benchmark."""
@@ -31,7 +33,11 @@ def main() -> None:
     scaling.add_argument("--repeats", type=int, default=3)
     scaling.add_argument("--figure", type=Path, default=Path("docs/figures/scaling.svg"))
 
+    for command in (online, estimator, scaling):
+        command.add_argument("--clock", choices=CLOCKS, default="wall", help="cpu: seconds summed over threads")
+
     options = parser.parse_args()
+    choose_clock(options.clock)
     if options.command == "online":
         from benchmarks.online import compare_rounds
 

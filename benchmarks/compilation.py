@@ -6,7 +6,8 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
+
+from benchmarks.timing import choose_clock, chosen_clock, now
 
 __all__ = ["measure_compilation"]
 
@@ -19,7 +20,7 @@ def measure_compilation() -> tuple[float, float]:
             "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
             "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
         }
-        command = [sys.executable, "-W", "ignore", "-m", "benchmarks.compilation"]
+        command = [sys.executable, "-W", "ignore", "-m", "benchmarks.compilation", chosen_clock()]
         laps = [
             float(subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout)
             for _ in range(2)
@@ -39,10 +40,11 @@ def _compile_run() -> float:
     setup = online.Setup.create(system, default_learner("cartpole", system, task), task)
     target = SimulatedTarget(system, task, jax.numpy.array([0.5, 0.3]))
     run = jax.jit(lambda key, setup, target: online.run(key, setup, target, rounds=30))
-    start = time.perf_counter()
+    start = now()
     run.lower(jax.random.key(0), setup, target).compile()
-    return time.perf_counter() - start
+    return now() - start
 
 
 if __name__ == "__main__":
+    choose_clock(sys.argv[1])
     print(_compile_run())

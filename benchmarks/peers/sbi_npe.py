@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import time
 import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
+from benchmarks.timing import now
 
 __all__ = ["NpeResult", "fit_npe"]
 
@@ -19,7 +20,7 @@ class NpeResult:
     log_q: float
     """Mean log q(θ | trajectory) over the held-out pairs, θ in raw units."""
     seconds: float
-    """Wall-clock time of `train`, which stops by itself when its validation loss has not fallen for 20 epochs."""
+    """Time of `train`, which stops by itself when its validation loss has not fallen for 20 epochs."""
     epochs: int
 
 
@@ -69,9 +70,9 @@ def fit_npe(
             show_progress_bars=False,
         )
         inference.append_simulations(as_tensor(theta), as_tensor(rows))
-        start = time.perf_counter()
+        start = now()
         density = inference.train()
-        seconds = time.perf_counter() - start
+        seconds = now() - start
         with torch.no_grad():
             log_q = density.log_prob(as_tensor(held_theta)[None], as_tensor(held_rows))[0]
     return NpeResult(float(log_q.mean()), seconds, int(inference.summary["epochs_trained"][-1]))

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from benchmarks.timing import Parts
+from benchmarks.timing import Parts, now
 
 __all__ = ["PeerRound", "Trajectories", "collect", "fit_density", "run_round"]
 
@@ -49,13 +48,13 @@ def run_round(seed: int, policy_steps: int = 15_000, count: int = 200, steps: in
 
     env = make_env(seed, steps)
     model = PPO("MlpPolicy", env, seed=seed, device="cpu")
-    start = time.perf_counter()
+    start = now()
     model.learn(policy_steps)
-    learned = time.perf_counter()
+    learned = now()
     trajectories = collect(model, seed + 1, count, steps)
-    collected = time.perf_counter()
+    collected = now()
     fit_density(trajectories, seed=seed, epochs=epochs)
-    end = time.perf_counter()
+    end = now()
     parts = Parts(policy=learned - start, rollouts=collected - learned, estimator=end - collected)
     return PeerRound(parts, model, trajectories, model.num_timesteps)
 
@@ -152,12 +151,12 @@ def fit_density(
 
     history, seconds = [], 0.0
     for _ in range(epochs):
-        start = time.perf_counter()
+        start = now()
         for picks in torch.randperm(len(theta)).split(batch):
             optimizer.zero_grad()
             (-log_prob(theta[picks], rows[picks]).mean()).backward()
             optimizer.step()
-        seconds += time.perf_counter() - start
+        seconds += now() - start
         if held is not None:
             with torch.no_grad():
                 score = log_prob(*held).mean()
