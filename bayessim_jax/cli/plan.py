@@ -141,7 +141,7 @@ def _truth(settings: Settings, box: Box, seed: int) -> Float[np.ndarray, " d"]:
     """The hidden parameters of a seed: those given, the others drawn from the prior."""
     _check_names(settings.truth, box.names, "truth")
     key = jax.random.fold_in(jax.random.key(seed), TRUTH)
-    drawn = np.asarray(box.low + jax.random.uniform(key, (box.size,)) * box.width)
+    drawn = np.array(box.low + jax.random.uniform(key, (box.size,)) * box.width)
     low, high = np.asarray(box.low), np.asarray(box.high)
     for i, name in enumerate(box.names):
         if name in settings.truth:

@@ -96,7 +96,7 @@ def worries(run: OnlineRun) -> list[str]:
         )
     if (n := int(np.nansum(at("overfit")))) > 0:
         found.append(
-            f"The last fit over-fitted{_in(n, several)}; the weights that were best on held-out simulations were kept."
+            f"The last fit over-fitted after its best epoch{_in(n, several)}; the weights of that epoch were kept."
         )
     found += _against_truth(run, several)
     if (n := int(np.nansum(run.series("diverged")))) > 0:

@@ -119,6 +119,18 @@ def test_the_command_itself(capsys):
         assert hint in captured.err
 
 
+def test_systems_are_listed_with_priors_and_units(capsys):
+    assert main(["systems"]) == 0
+    told = capsys.readouterr().out
+    assert "length 0.1 to 1 m, mass 0.1 to 1 kg" in told
+    assert "angle_dot (rad/s)" in told
+    assert [line.split(":")[0] for line in told.splitlines() if line[:1].isalpha()] == [
+        "cartpole",
+        "pendulum",
+        "acrobot",
+    ]
+
+
 @pytest.mark.parametrize("words", [["--help"], ["--version"], ["online", "--help"], ["online", "cartpol"]])
 def test_help_and_bad_usage_are_answered_without_jax(words):
     code = (

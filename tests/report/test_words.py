@@ -50,7 +50,7 @@ def test_several_seeds_are_summed_up():
     ("change", "word"),
     [
         ({"overconfident": True, "coverage90": 0.6}, "over-confident: only 60%"),
-        ({"overfit": True}, "over-fitted"),
+        ({"overfit": True}, "over-fitted after its best epoch"),
         ({"collapsed": True}, "collapsed in 4 rounds"),
         ({"prior_share": 1.0}, "no usable posterior"),
         ({"diverged": 2}, "8 simulations gave numbers that are not finite"),

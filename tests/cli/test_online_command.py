@@ -1,0 +1,251 @@
+"""`bayessim online` itself: bad input before anything is written, and one small run against Gymnasium."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+
+from bayessim_jax import online
+from bayessim_jax.cli.config_file import settings_from
+from bayessim_jax.cli.main import main
+from bayessim_jax.cli.options import Settings
+from bayessim_jax.cli.plan import make_plan
+
+TINY = """
+system = "cartpole"
+encoder = "summary"
+rounds = 3
+simulations = 20
+steps = 10
+pool = 2
+components = 2
+
+[schedule]
+epochs = 10
+
+[learner]
+episodes = 8
+episode_steps = 10
+envs = 4
+horizon = 10
+epochs = 2
+minibatches = 2
+"""
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(autouse=True)
+def own_settings(cache, monkeypatch):
+    """The command switches the compilation cache on: put it aside, and JAX's settings back."""
+    names = (
+        "jax_compilation_cache_dir",
+        "jax_persistent_cache_min_compile_time_secs",
+        "jax_persistent_cache_min_entry_size_bytes",
+    )
+    before = {name: getattr(jax.config, name) for name in names}
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(cache))
+    yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+
+
+def refused(capsys, *words):
+    """The one line on standard error."""
+    assert main(["online", *map(str, words)]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("bayessim: ")
+    assert captured.err.count("\n") == 1
+    return captured.err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--truth lenght=0.5", "truth: unknown parameter 'lenght': did you mean 'length'?"),
+        ("--truth length=3", "truth length=3.0 lies outside the prior, 0.1 to 1.0 m"),
+        ("--truth length=nan", "truth length=nan lies outside the prior"),
+        ("--seed -3", "seed is -3; it must be 0 or more."),
+    ],
+)
+def test_bad_words(capsys, tmp_path, words, message):
+    assert message in refused(capsys, "cartpole", *words.split(), "--out", tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[prior]\nlenght = [0.1, 0.5]", "prior: unknown parameter 'lenght': did you mean 'length'?"),
+        ("[learner]\nenvz = 3", "[learner]: unknown key 'envz': did you mean 'envs'?"),
+        ("[learner]\nenvs = 2.5", "[learner]: envs is 2.5; it needs a whole number."),
+        ("[learner]\nminibatches = 7", "minibatches 7 must divide"),
+        ("[schedule]\nepoch = 3", "[schedule]: unknown key 'epoch': did you mean 'epochs'?"),
+        ("[schedule]\nlearning_rate = 'high'", "[schedule]: learning_rate is 'high'; it needs a number."),
+        ("truth = { length = 0.9 }\nprior = { length = [0.1, 0.5] }", "outside the prior, 0.1 to 0.5 m"),
+    ],
+)
+def test_bad_config(capsys, tmp_path, text, message):
+    (tmp_path / "c.toml").write_text(text)
+    assert message in refused(capsys, "cartpole", "--config", tmp_path / "c.toml", "--out", tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_bad_folders(capsys, tmp_path):
+    (tmp_path / "note.txt").write_text("mine")
+    assert "already used; continue with --resume" in refused(capsys, "cartpole", "--out", tmp_path)
+    assert "is a file" in refused(capsys, "cartpole", "--out", tmp_path / "note.txt")
+    assert "cannot write" in refused(capsys, "cartpole", "--out", tmp_path / "note.txt" / "run")
+    assert "no run in" in refused(capsys, "cartpole", "--out", tmp_path / "none", "--resume")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["note.txt"]
+
+
+def stored(folder, **changes):
+    """A run folder with settings and facts, but nothing computed."""
+    folder.mkdir()
+    lines = {"system": '"cartpole"', "seed": "3", "rounds": "4", **changes}
+    (folder / "config.toml").write_text("\n".join(f"{k} = {v}" for k, v in lines.items()))
+    (folder / "run.json").write_text("{}")
+    return folder
+
+
+def test_a_run_of_another_configuration_is_not_continued(capsys, tmp_path):
+    out = stored(tmp_path / "run")
+    told = refused(capsys, "cartpole", "--seed", 4, "--encoder", "lstm", "--out", out, "--resume")
+    assert "seed is 3 there and 4 in the command" in told
+    assert "encoder is 'framed_lstm' there and 'lstm' in the command" in told
+    assert "system is 'cartpole' there" in refused(capsys, "pendulum", "--out", out, "--resume")
+    assert "truth.mass is not set there and 0.3" in refused(
+        capsys, "cartpole", "--truth", "mass=0.3", "--out", out, "--resume"
+    )
+    (tmp_path / "c.toml").write_text("steps = 7")
+    told = refused(capsys, "cartpole", "--config", tmp_path / "c.toml", "--out", out, "--resume")
+    assert "steps is 50 there and 7" in told
+    # the same words as before, or none at all, differ in nothing: what is missing now is the checkpoint
+    assert "no checkpoint" in refused(capsys, "--out", out, "--resume")
+    assert "no checkpoint" in refused(capsys, "cartpole", "--seed", 3, "--rounds", 9, "--out", out, "--resume")
+
+
+def test_damaged_runs_are_not_continued(capsys, tmp_path):
+    out = stored(tmp_path / "a")
+    (out / "run.json").write_text('{"status": "run')
+    assert "run.json is missing or damaged" in refused(capsys, "cartpole", "--out", out, "--resume")
+    out = stored(tmp_path / "b", ronds="3")
+    assert "config.toml: unknown key 'ronds'" in refused(capsys, "cartpole", "--out", out, "--resume")
+    out = stored(tmp_path / "c")
+    (out / "config.toml").write_text("= 3")
+    assert "config.toml is missing or damaged" in refused(capsys, "cartpole", "--out", out, "--resume")
+
+
+def test_a_plan_is_complete_and_repeats():
+    plan = make_plan(Settings("cartpole", seed=5, seeds=2, truth={"mass": 0.3}, prior={"length": (0.2, 0.8)}))
+    assert plan.settings.prior == {"length": (0.2, 0.8), "mass": (0.1, 1.0)}
+    assert plan.settings.schedule["epochs"] > 0
+    assert plan.settings.learner["envs"] > 0
+    assert plan.seeds == [5, 6]
+    lengths, masses = plan.truths.T
+    assert masses == pytest.approx([0.3, 0.3])
+    assert lengths[0] != lengths[1]
+    assert ((lengths >= 0.2) & (lengths <= 0.8)).all()
+    again = make_plan(plan.settings)
+    assert again.settings == plan.settings
+    np.testing.assert_array_equal(again.truths, plan.truths)
+    alone = make_plan(Settings("cartpole", seed=6, truth={"mass": 0.3}, prior={"length": (0.2, 0.8)}))
+    np.testing.assert_array_equal(alone.truths[0], plan.truths[1])
+
+
+def lines(path):
+    read = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in line.items() if k not in ("seconds", "simulations_per_second")} for line in read]
+
+
+def tiny_plan():
+    return make_plan(Settings(**settings_from(tomllib.loads(TINY), "here")))
+
+
+def test_a_small_run_end_to_end(tmp_path, capsys):
+    """Against Gymnasium's environment, cut after two rounds and resumed."""
+    (tmp_path / "tiny.toml").write_text(TINY)
+    run = tmp_path / "run"
+    words = ["online", "--config", str(tmp_path / "tiny.toml"), "--out", str(run)]
+    assert main([*words, "--rounds", "2", "--quiet"]) == 0
+    assert main(["online", "--out", str(run), "--rounds", "3", "--resume"]) == 0
+    assert "round 3/3" in capsys.readouterr().err
+    told = lines(run)
+    assert [line["round"] for line in told] == [1, 2, 3]
+    assert all(line["return_target"] > 0 for line in told)
+    facts = json.loads((run / "run.json").read_text())
+    assert facts["status"] == "finished"
+    assert "barto1983neuronlike" in facts["citations"]
+    assert "hochreiter1997long" not in facts["citations"]
+    with xr.open_datatree(run / "posterior.nc", engine="h5netcdf") as tree:
+        seen = tree["observed_data"].to_dataset().load()
+        length = tree["posterior"]["length"].load()
+    assert seen["angle"].shape == (3, 1, 11)
+    assert abs(seen["angle"].values[:, :, 0]).max() < 0.2
+    truth = facts["truth"]["length"]
+    assert length.attrs["truth"] == truth == pytest.approx(float(tiny_plan().truths[0, 0]))
+    assert float(length.mean()) == pytest.approx(told[-1]["mean"]["length"], rel=1e-5)
+    before = (run / "report.html").read_text()
+    (run / "report.html").unlink()
+    assert main(["report", str(run)]) == 0
+    assert (run / "report.html").read_text() == before
+
+
+@pytest.mark.slow
+def test_the_command_does_what_the_library_does(tmp_path):
+    """The rounds that the command puts together are those of one `online.run`, bit for bit."""
+    (tmp_path / "tiny.toml").write_text(TINY)
+    assert main(["online", "--config", str(tmp_path / "tiny.toml"), "--out", str(tmp_path / "run"), "--quiet"]) == 0
+    plan = tiny_plan()
+    run = jax.jit(lambda key, setup, target: online.run(key, setup, target, rounds=3))
+    _, infos = run(jax.random.key(0), plan.setup, plan.target)
+    with xr.open_datatree(tmp_path / "run" / "posterior.nc", engine="h5netcdf") as tree:
+        seen = tree["observed_data"].to_dataset().load()
+    x = np.stack([seen[name].values for name in plan.setup.system.observations.names], axis=-1)
+    np.testing.assert_array_equal(x, infos.recordings.observations)
+    told = lines(tmp_path / "run")
+    np.testing.assert_array_equal([line["log_q_validation"] for line in told], infos.fit.log_q_validation)
+    np.testing.assert_array_equal([line["return_target"] for line in told], infos.return_target)
+    exact = jax.vmap(lambda belief: belief.log_prob(jnp.asarray(plan.truths[0])))(infos.belief)
+    np.testing.assert_allclose([line["log_prob_true"] for line in told], exact, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_a_process_that_is_stopped_goes_on_as_if_it_had_not_been(tmp_path, number):
+    (tmp_path / "tiny.toml").write_text(TINY.replace("rounds = 3", "rounds = 40"))
+    command = [sys.executable, "-c", "import sys; from bayessim_jax.cli.main import main; sys.exit(main())", "online"]
+    start = [*command, "--config", str(tmp_path / "tiny.toml"), "--out"]
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    subprocess.run([*start, str(whole), "--quiet"], check=True, timeout=600)
+    process = subprocess.Popen([*start, str(cut)], stderr=subprocess.PIPE, text=True)
+    while not (Path(cut) / "metrics.jsonl").exists() or len(lines(cut)) < 3:
+        time.sleep(0.02)
+        assert process.poll() is None
+    process.send_signal(number)
+    _, told = process.communicate(timeout=300)
+    assert process.returncode == (130 if number == signal.SIGINT else -9)
+    assert "Traceback" not in told
+    assert ("--resume" in told) == (number == signal.SIGINT)
+    assert len(lines(cut)) < 40
+    subprocess.run([*command, "--out", str(cut), "--resume", "--quiet"], check=True, timeout=600)
+    assert lines(cut) == lines(whole)
+    with (
+        xr.open_datatree(whole / "posterior.nc", engine="h5netcdf") as a,
+        xr.open_datatree(cut / "posterior.nc", engine="h5netcdf") as b,
+    ):
+        xr.testing.assert_identical(a, b)
