@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -72,9 +73,11 @@ class Plan:
             return _over_seeds(one, len(self.seeds))(keys, thetas, states)
 
         seen = jax.eval_shape(record, setup, keys, thetas, states)
-        recorder = jax.jit(record).lower(setup, keys, thetas, states).compile()
-        updater = jax.jit(update).lower(setup, keys, states, seen).compile()
-        evaluator = jax.jit(evaluate).lower(setup, keys, thetas, states).compile()
+        with ThreadPoolExecutor() as pool:  # the two are compiled while the third is traced
+            recorder = pool.submit(jax.jit(record).lower(setup, keys, thetas, states).compile)
+            evaluator = pool.submit(jax.jit(evaluate).lower(setup, keys, thetas, states).compile)
+            updater = jax.jit(update).lower(setup, keys, states, seen).compile()
+        recorder, evaluator = recorder.result(), evaluator.result()
 
         def advance(states: online.State) -> tuple[online.State, online.RoundInfo]:
             recordings = recorder(setup, keys, thetas, states)
