@@ -177,29 +177,39 @@ class Belief(Protocol):
 
 @runtime_checkable
 class Estimator(Protocol[E]):
-    """Learns q(θ | recordings) from simulations.
+    """Learns q(θ | recordings) from simulations, θ in raw units drawn from a proposal.
 
-    θ reaches the estimator in its own unit coordinates, z = (θ − shift) / scale; the caller chooses them. One
-    posterior is conditioned on a set of recordings that share θ: every `recordings` leaf has a leading `set` axis.
+    A posterior is conditioned on a set of recordings that share θ; `use` says which of them count.
     """
 
     def init(self, key: PRNGKeyArray, example: Recording, d: int) -> E:
-        """Random weights for recordings shaped like `example` (one set) and `d` parameters."""
+        """Random weights for recordings shaped like `example` (leading axis: the set) and `d` parameters."""
         ...
 
     def fit(
         self,
         key: PRNGKeyArray,
         state: E,
-        z: Float[Array, "n d"],
+        thetas: Float[Array, "n d"],
         recordings: Recording,
         weights: Float[Array, " n"],
     ) -> tuple[E, Any]:
-        """Continue from `state` and maximize Σ wᵢ log q(zᵢ | recordingsᵢ); a weight of zero switches a pair off."""
+        """Continue from `state` and maximize Σ wᵢ log q(θᵢ | recordingᵢ); a weight of zero switches a draw off."""
         ...
 
-    def posterior(self, state: E, recordings: Recording) -> Any:
-        """The Gaussian mixture q(z | recordings) in unit coordinates, one for one set."""
+    def calibrate(
+        self,
+        key: PRNGKeyArray,
+        state: E,
+        thetas: Float[Array, "n d"],
+        recordings: Recording,
+        use: Bool[Array, " set"],
+    ) -> tuple[E, Any]:
+        """Correct the posterior of sets on sets that were never trained on (leading axes of recordings: n, set)."""
+        ...
+
+    def posterior(self, state: E, recordings: Recording, use: Bool[Array, " set"]) -> Any:
+        """The Gaussian mixture q(θ | recordings in use) under the proposal of the last fit, for one set."""
         ...
 
 

@@ -20,7 +20,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bayessim_jax.beliefs import Truncated
 from bayessim_jax.contracts import Estimator, Learner, Recording, Scalar, System, Target, Task
@@ -43,13 +43,17 @@ class Setup:
     steps: int = struct.field(pytree_node=False, default=50)
     """Transitions in a recording, real or simulated."""
     simulations: int = struct.field(pytree_node=False, default=200)
-    """Draws of θ that are simulated in a round; each gives as many trajectories as the target gives recordings."""
+    """Trajectories that are simulated in a round to fit the estimator, each with its own θ."""
     recordings: int = struct.field(pytree_node=False, default=1)
-    """Trajectories of the target in a round; together they are one piece of evidence."""
+    """Trajectories of the target in a round."""
     evaluations: int = struct.field(pytree_node=False, default=1)
     """Episodes of the task's full length on which the deterministic policy is judged in a round; 0 for none."""
     pool: int = struct.field(pytree_node=False, default=10)
     """Rounds whose simulations are kept for the fit."""
+    history: int = struct.field(pytree_node=False, default=32)
+    """Recordings of the target that are remembered, the newest; the posterior is conditioned on all of them."""
+    calibrations: int = struct.field(pytree_node=False, default=64)
+    """Draws of θ for which as many recordings are simulated as the target has given, to calibrate their posterior."""
     components: int = struct.field(pytree_node=False, default=5)
     """Gaussians in the belief."""
 
@@ -68,6 +72,8 @@ class Setup:
         for name, value in sizes.items():
             if value < (0 if name == "evaluations" else 1):
                 raise ValueError(f"Setup: {name} is {value}; it must be a positive number.")
+        if sizes.get("history", cls.history) % sizes.get("recordings", cls.recordings):
+            raise ValueError("Setup: history must be a multiple of recordings, so that a round's set stays together.")
         return cls(
             system=system,
             learner=learner,
@@ -80,7 +86,7 @@ class Setup:
 
 @struct.dataclass
 class Pool:
-    """Simulations of the last rounds: axes are (round slot, draw of θ, recording of the set, …)."""
+    """Simulations of the last rounds: axes are (round slot, draw of θ, 1, …)."""
 
     thetas: Float[Array, "rounds n d"]
     recordings: Recording
@@ -97,6 +103,8 @@ class State:
     estimator: Any
     learner: Any
     pool: Pool
+    history: Recording
+    """What the target has shown, leading axis `setup.history`; the slots not yet filled are empty recordings."""
 
 
 @struct.dataclass
@@ -108,8 +116,9 @@ class RoundInfo:
     recordings: Recording
     """What the target showed in this round, with a leading `set` axis."""
     fit: Any
-    """The estimator's Info: `log_q_train`, `log_q_validation`, `best_epoch`, `coverage90`, `overfit`,
-    `overconfident`, `nonfinite`."""
+    """The estimator's Info of the fit: `log_q_train`, `log_q_validation`, `best_epoch`, `overfit`, `nonfinite`."""
+    calibration: Any
+    """The estimator's Info of the calibration: `coverage90`, `widen`, `overconfident`."""
     learning: Any
     """The learner's Info: at least `return_mean` and `nonfinite`."""
     return_target: Scalar
@@ -119,7 +128,7 @@ class RoundInfo:
     pool_size: Scalar
     """Effective number of simulations that the fit stood on, (Σ w)² / Σ w²."""
     collapsed: Any
-    """The belief fell to less than a thousandth of its volume in one round while the fit was over-confident."""
+    """The belief fell to less than a thousandth of its volume in one round while the estimator was over-confident."""
 
 
 def init(key: PRNGKeyArray, setup: Setup) -> State:
@@ -129,32 +138,37 @@ def init(key: PRNGKeyArray, setup: Setup) -> State:
     learner = setup.learner.init(learner_key)
     proposal = setup.proposal.propose(belief)
     d = setup.system.parameters.size
-    shape = jax.eval_shape(lambda: simulate(key, setup, learner, belief.box.low[None].repeat(setup.simulations, 0)))
-    example = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:], leaf.dtype), shape)
+    one = jax.eval_shape(lambda: simulate(key, setup, learner, belief.box.low[None], 1))
     slots = setup.pool if setup.proposal.reuse else 1
+
+    def empty(*axes: int) -> Recording:
+        return jax.tree.map(lambda leaf: jnp.zeros((*axes, *leaf.shape[2:]), leaf.dtype), one)
+
     return State(
         round=jnp.array(0),
         belief=belief,
-        estimator=setup.estimator.init(estimator_key, example, d),
+        estimator=setup.estimator.init(estimator_key, empty(1), d),
         learner=learner,
         pool=Pool(
             thetas=jnp.broadcast_to(belief.box.low, (slots, setup.simulations, d)),
-            recordings=jax.tree.map(lambda leaf: jnp.zeros((slots, *leaf.shape), leaf.dtype), shape),
+            recordings=empty(slots, setup.simulations, 1),
             proposals=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (slots, *jnp.shape(leaf))), proposal),
             filled=jnp.zeros(slots),
         ),
+        history=empty(setup.history if setup.proposal.accumulate else setup.recordings),
     )
 
 
-def simulate(key: PRNGKeyArray, setup: Setup, learner: Any, thetas: Float[Array, "n d"]) -> Recording:
-    """A set of recordings for each θ, under the current stochastic policy; leading axes (n, set)."""
+def simulate(key: PRNGKeyArray, setup: Setup, learner: Any, thetas: Float[Array, "n d"], each: int) -> Recording:
+    """`each` recordings for every θ under the current stochastic policy; leading axes (n, each)."""
     policy = setup.learner.policy(learner)
 
     def one(key: PRNGKeyArray, theta: Float[Array, " d"]) -> Recording:
         return rollout(key, setup.system, theta, policy, setup.steps, setup.task)
 
-    keys = jax.random.split(key, (thetas.shape[0], setup.recordings))
-    return jax.vmap(jax.vmap(one, (0, None)))(keys, thetas)
+    keys = jax.random.split(key, thetas.shape[0] * each)
+    flat = jax.vmap(one)(keys, jnp.repeat(thetas, each, axis=0))
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, each, *leaf.shape[1:]), flat)
 
 
 def record(key: PRNGKeyArray, setup: Setup, target: Target, state: State) -> Recording:
@@ -180,33 +194,43 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
             f"update: recordings have shape {recordings.valid.shape} (set, steps); this setup was made for "
             f"({setup.recordings}, {setup.steps}): pad the recordings or change `recordings` and `steps`."
         )
-    draw_key, simulate_key, fit_key, learn_key = jax.random.split(jax.random.fold_in(key, state.round), 4)
+    draw_key, simulate_key, fit_key, calibrate_key, learn_key = jax.random.split(
+        jax.random.fold_in(key, state.round), 5
+    )
+    # simulate around the belief: some to fit the estimator, some to calibrate what it says of sets
     proposal = setup.proposal.propose(state.belief)
-    thetas = jax.vmap(proposal.sample)(jax.random.split(draw_key, setup.simulations))
-    simulated = simulate(simulate_key, setup, state.learner, thetas)
-    pool = _insert(state.pool, state.round, thetas, simulated, proposal)
+    fresh = setup.simulations
+    thetas = jax.vmap(proposal.sample)(jax.random.split(draw_key, fresh + setup.calibrations))
+    simulated = simulate(simulate_key, setup, state.learner, thetas[:fresh], 1)
+    pool = _insert(state.pool, state.round, thetas[:fresh], simulated, proposal)
     weights = pool_weights(pool.thetas, pool.proposals, pool.filled, proposal).ravel()
-
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (pool.thetas, pool.recordings))
     estimator, fit = setup.estimator.fit(fit_key, state.estimator, *flat, weights)
-    q = setup.estimator.posterior(estimator, recordings)
+
+    # the posterior of everything the target has shown
+    history, use = _remember(state.history, state.round, recordings)
+    sets = simulate(jax.random.fold_in(calibrate_key, 0), setup, state.learner, thetas[fresh:], use.size)
+    calibrated, calibration = setup.estimator.calibrate(calibrate_key, estimator, thetas[fresh:], sets, use)
+    estimator = calibrated if setup.proposal.accumulate else estimator
+    q = setup.estimator.posterior(estimator, history, use)
     posterior = setup.proposal.combine(state.belief, proposal, q)
-    unusable = recordings.diverged.any()
+    unusable = recordings.diverged.all()
     belief = jax.tree.map(lambda old, new: jnp.where(unusable, old, new), state.belief, posterior)
     learner, learning = setup.learner.step(learn_key, state.learner, belief)
 
-    shrinkage = jnp.linalg.slogdet(belief.covariance())[1] - jnp.linalg.slogdet(state.belief.covariance())[1]
+    shrinkage = _log_volume(belief) - _log_volume(state.belief)
     info = RoundInfo(
         belief=belief,
         recordings=recordings,
         fit=fit,
+        calibration=calibration,
         learning=learning,
         return_target=jnp.array(jnp.nan),
         diverged=simulated.diverged.sum(),
         pool_size=weights.sum() ** 2 / (weights**2).sum(),
-        collapsed=(0.5 * shrinkage < -jnp.log(1e3)) & fit.overconfident,
+        collapsed=(shrinkage < -jnp.log(1e3)) & calibration.overconfident,
     )
-    return State(state.round + 1, belief, estimator, learner, pool), info
+    return State(state.round + 1, belief, estimator, learner, pool, history), info
 
 
 def run(
@@ -229,3 +253,16 @@ def _insert(pool: Pool, round_: Array, thetas: Array, recordings: Recording, pro
     return jax.tree.map(
         lambda leaf, new: leaf.at[slot].set(new), pool, Pool(thetas, recordings, proposal, jnp.ones(()))
     )
+
+
+def _remember(history: Recording, round_: Array, recordings: Recording) -> tuple[Recording, Bool[Array, " history"]]:
+    """Overwrite the oldest recordings; which slots hold one that is sound."""
+    size, new = history.diverged.size, recordings.diverged.size
+    rows = (round_ * new + jnp.arange(new)) % size
+    history = jax.tree.map(lambda leaf, part: leaf.at[rows].set(part), history, recordings)
+    return history, (jnp.arange(size) < (round_ + 1) * new) & ~history.diverged
+
+
+def _log_volume(belief: Truncated) -> Scalar:
+    """Half the log determinant of the covariance of the mixture."""
+    return 0.5 * jnp.linalg.slogdet(belief.mixture.covariance())[1]

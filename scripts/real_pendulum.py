@@ -10,6 +10,7 @@ the oscillation gives, L = g (T₀/2π)², with T₀ the period corrected for th
 from __future__ import annotations
 
 import sys
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +62,7 @@ def length_from_period(path: Path) -> float:
     up = np.flatnonzero((angle[:-1] < 0) & (angle[1:] >= 0))
     crossings = time[up] - angle[up] * (time[up + 1] - time[up]) / (angle[up + 1] - angle[up])
     lengths = []
-    for begin, end in zip(crossings[:-1], crossings[1:], strict=True):
+    for begin, end in pairwise(crossings):
         a = np.abs(angle[(time >= begin) & (time <= end)]).max()
         small = (end - begin) / (1 + a**2 / 16 + 11 * a**4 / 3072)
         lengths.append(GRAVITY * (small / (2 * np.pi)) ** 2)

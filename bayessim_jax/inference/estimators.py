@@ -9,15 +9,16 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from bayessim_jax.beliefs import GaussianMixture, reduce
-from bayessim_jax.contracts import Recording
+from bayessim_jax.beliefs import GaussianMixture
+from bayessim_jax.contracts import Recording, Scalar
 from bayessim_jax.inference.encoders import Encoder, lookup_encoder, transition_features
 from bayessim_jax.inference.evidence import Recalibration, combine_evidence, credible_level, recalibrate
-from bayessim_jax.inference.fit import FitInfo, Schedule, fit, systematic
+from bayessim_jax.inference.fit import FitInfo, Schedule, fit
 from bayessim_jax.inference.heads import MixtureHead
 from bayessim_jax.inference.summaries import FourierSummary, Summary
 
 __all__ = [
+    "CalibrationInfo",
     "EstimatorState",
     "MixtureDensity",
     "fourier_mixture",
@@ -42,14 +43,26 @@ class EstimatorState:
 
 
 @struct.dataclass
+class CalibrationInfo:
+    """How the posterior of simulated sets did before it was recalibrated."""
+
+    coverage90: Scalar
+    """Share of truths inside their 90 % credible set; far below 0.9 is over-confident."""
+    widen: Scalar
+    """Factor on the posterior's standard deviations (geometric mean over axes) that recalibration asked for."""
+    overconfident: Bool[Array, ""]
+    """Coverage at 90 % is below 0.5 by more than chance allows: more than recalibration should be asked to mend."""
+
+
+@struct.dataclass
 class MixtureDensity:
     """Encoder and mixture head, trained jointly; an ensemble of them; evidence of a set; recalibration.
 
     The networks learn q(θ | one recording). With few simulations a single network is over-confident: several, each with
     another fold held out to stop it early, are averaged. The posterior of a set is the product of the evidence of its
-    recordings (`combine_evidence`). What is still wrong with it, above all the errors that the members of a set have in
-    common and that a product would multiply, is measured on simulated sets that no network was trained on, and taken
-    out (`recalibrate`).
+    recordings (`combine_evidence`). What is still wrong with it, above all the error that the network makes at one θ
+    for every recording alike and that a product takes for evidence, is measured on simulated sets of the same size that
+    no network was trained on, and taken out (`recalibrate`).
 
     θ is standardized by the weighted mean and standard deviation of each fit's pairs; the head's last layer is
     rewritten for the new units, so warm weights keep their meaning.
@@ -60,12 +73,12 @@ class MixtureDensity:
     schedule: Schedule
     members: int = struct.field(pytree_node=False, default=4)
     """Networks in the ensemble."""
-    folds: int = struct.field(pytree_node=False, default=8)
-    """Draws of θ are dealt to folds in turn. Member m never trains on fold m, nobody trains on the last."""
+    folds: int = struct.field(pytree_node=False, default=5)
+    """Draws of θ are dealt to folds in turn; member m never trains on fold m."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.members < self.folds:
-            raise ValueError(f"MixtureDensity: {self.members} members need more than {self.members} folds.")
+        if not 1 <= self.members <= self.folds or self.folds < 2:
+            raise ValueError(f"MixtureDensity: {self.members} members need as many folds, and at least two.")
 
     def init(self, key: PRNGKeyArray, example: Recording, d: int) -> EstimatorState:
         """Random weights for sets of recordings shaped like `example` (leading axis: the set)."""
@@ -85,7 +98,7 @@ class MixtureDensity:
             feature_scale=jnp.ones(features),
             shift=jnp.zeros(d),
             scale=jnp.ones(d),
-            recalibration=Recalibration(jnp.zeros(d), jnp.ones(())),
+            recalibration=Recalibration.none(d),
             fitted=jnp.array(False),
         )
 
@@ -98,7 +111,6 @@ class MixtureDensity:
         weights: Float[Array, " n"],
     ) -> tuple[EstimatorState, FitInfo]:
         """Continue from `state`; scores in the Info are log densities in the units of θ, for one recording."""
-        fit_key, judge_key = jax.random.split(key)
         weights = jnp.where(recordings.diverged.any(-1), 0.0, weights)
         state = self._set_units(state, thetas, recordings, weights)
         z = (thetas - state.shift) / state.scale
@@ -110,40 +122,49 @@ class MixtureDensity:
 
         def member(args: Any) -> Any:
             index, key, params = args
-            train = jnp.where(each_fold == self.folds - 1, 0.0, each_weight)
-            return fit(key, params, self._log_prob, flat, each_z, train, each_fold == index, self.schedule)
+            return fit(key, params, self._log_prob, flat, each_z, each_weight, each_fold == index, self.schedule)
 
         # one after the other: batched small matrix products are slower than a loop on a CPU
-        keys = jax.random.split(fit_key, self.members)
+        keys = jax.random.split(key, self.members)
         params, infos = jax.lax.map(member, (jnp.arange(self.members), keys, state.params))
         state = state.replace(params=params)
 
-        rows_key, level_key = jax.random.split(judge_key)
-        spare = jnp.where(fold == self.folds - 1, weights, 0.0)
-        rows = systematic(rows_key, spare, min(self.schedule.validation_draws, z.shape[0]))
-        shown = jax.tree.map(lambda leaf: leaf[rows], inputs)
-        plain = jax.lax.map(lambda one: self._combined(params, *one), shown)
-        count = jnp.minimum(spare.sum() ** 2 / jnp.maximum((spare**2).sum(), 1e-12), rows.size)
-        recalibration = recalibrate(plain, z[rows], count)
-        level = credible_level(level_key, plain, z[rows])
-        coverage, units = (level <= 0.9).mean(), jnp.log(state.scale).sum()
-        return state.replace(recalibration=recalibration), FitInfo(
+        units = jnp.log(state.scale).sum()
+        return state, FitInfo(
             log_q_train=infos.log_q_train.mean() - units,
             log_q_validation=infos.log_q_validation.mean() - units,
             best_epoch=infos.best_epoch.max(),
             epochs=infos.epochs.max(),
-            coverage90=coverage,
-            widen=recalibration.widen,
             overfit=infos.overfit.any(),
-            overconfident=coverage < 0.75 - 3 * jnp.sqrt(0.9 * 0.1 / jnp.maximum(count, 1.0)),
             nonfinite=infos.nonfinite.sum(),
         )
 
-    def posterior(self, state: EstimatorState, recordings: Recording) -> GaussianMixture:
-        """The mixture q(θ | recordings), for one set, in the units of θ."""
+    def calibrate(
+        self,
+        key: PRNGKeyArray,
+        state: EstimatorState,
+        thetas: Float[Array, "n d"],
+        recordings: Recording,
+        use: Bool[Array, " set"],
+    ) -> tuple[EstimatorState, CalibrationInfo]:
+        """Measure the posterior of sets on sets that no network has seen, and take out what is wrong with it."""
+        z = (thetas - state.shift) / state.scale
+        x, valid = self._inputs(state, recordings)
+        plain = jax.lax.map(lambda one: self._combined(state.params, *one, use), (x, valid & use[:, None]))
+        recalibration = recalibrate(plain, z)
+        coverage = (credible_level(key, plain, z) <= 0.9).mean()
+        chance = 3 * jnp.sqrt(0.9 * 0.1 / z.shape[0])
+        return state.replace(recalibration=recalibration), CalibrationInfo(
+            coverage90=coverage,
+            widen=jnp.exp(jnp.log(jnp.diagonal(recalibration.stretch)).mean()),
+            overconfident=coverage < 0.5 - chance,
+        )
+
+    def posterior(self, state: EstimatorState, recordings: Recording, use: Bool[Array, " set"]) -> GaussianMixture:
+        """The mixture q(θ | recordings in use), for one set, in the units of θ."""
         x, valid = self._inputs(state, jax.tree.map(lambda leaf: leaf[None], recordings))
-        valid = valid & ~recordings.diverged[None, :, None]
-        plain = self._combined(state.params, x[0], valid[0])
+        use = use & ~recordings.diverged
+        plain = self._combined(state.params, x[0], valid[0] & use[:, None], use)
         return state.recalibration.apply(plain).affine(state.shift, state.scale)
 
     def _log_prob(self, params: Any, inputs: Any, z: Float[Array, "n d"]) -> Float[Array, " n"]:
@@ -154,7 +175,9 @@ class MixtureDensity:
         x = jnp.clip((x - state.feature_mean) / state.feature_scale, -10.0, 10.0)
         return jnp.where(recordings.valid[..., None], x, 0.0), recordings.valid
 
-    def _combined(self, params: Any, x: Float[Array, "set steps features"], valid: Array) -> GaussianMixture:
+    def _combined(
+        self, params: Any, x: Float[Array, "set steps features"], valid: Array, use: Bool[Array, " set"]
+    ) -> GaussianMixture:
         """The ensemble's posterior of one set in standardized θ, before recalibration."""
 
         def member(p: Any) -> GaussianMixture:
@@ -162,10 +185,12 @@ class MixtureDensity:
 
         each = jax.vmap(member, out_axes=1)(params)  # (set, members, K, …)
         each = jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0], -1, *leaf.shape[3:]), each)
+        alone = jax.tree.map(lambda leaf: leaf[jnp.argmax(use)], each)
         if x.shape[0] == 1:
-            return reduce(jax.tree.map(lambda leaf: leaf[0], each), self.head.components)
-        one = combine_evidence(each, valid.any(-1))
-        return jax.tree.map(lambda leaf: jnp.repeat(leaf, self.head.components, axis=0), one)
+            return alone
+        count = alone.log_weights.size
+        together = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), combine_evidence(each, use))
+        return jax.tree.map(lambda a, b: jnp.where(use.sum() > 1, a, b), together, alone)
 
     def _set_units(self, state: EstimatorState, thetas: Array, recordings: Recording, weights: Array) -> EstimatorState:
         x = jax.vmap(jax.vmap(transition_features))(recordings)

@@ -41,44 +41,62 @@ def combine_evidence(each: GaussianMixture, use: Bool[Array, " set"]) -> Gaussia
 
 @struct.dataclass
 class Recalibration:
-    """A correction of a posterior in the coordinates that its own moments whiten: a shift and a factor."""
+    """A correction of a posterior in the coordinates that its own moments whiten: a shift and a stretch."""
 
     shift: Float[Array, " d"]
-    widen: Scalar
+    stretch: Float[Array, "d d"]
+    """Lower triangular."""
+
+    @classmethod
+    def none(cls, d: int) -> Recalibration:
+        """The identity."""
+        return cls(jnp.zeros(d), jnp.eye(d))
 
     def apply(self, mixture: GaussianMixture) -> GaussianMixture:
-        """Move the whole by L · shift, and stretch it about its mean by `widen`; L Lᵀ is its covariance."""
+        """θ ↦ μ + L (shift + stretch L⁻¹ (θ − μ)), with μ and L Lᵀ the mean and covariance of the mixture."""
         mean, tril = moment_match(mixture)
+        inverse = jax.scipy.linalg.solve_triangular(tril, jnp.eye(mean.size), lower=True)
+        linear = tril @ self.stretch @ inverse
         return GaussianMixture(
             mixture.log_weights,
-            mean + tril @ self.shift + self.widen * (mixture.means - mean),
-            self.widen * mixture.scale_trils,
+            mean + tril @ self.shift + (mixture.means - mean) @ linear.T,
+            linear @ mixture.scale_trils,
         )
 
 
-def recalibrate(mixtures: GaussianMixture, truths: Float[Array, "n d"], count: Scalar) -> Recalibration:
+def recalibrate(mixtures: GaussianMixture, truths: Float[Array, "n d"]) -> Recalibration:
     """The correction that makes held-out truths look like draws of their posteriors.
 
-    r = L⁻¹ (θ − μ) of a calibrated posterior has mean zero, and ‖r‖² has the quantiles of χ²(d). The shift is the mean
-    of r, shrunk by ten pseudo-observations at zero; the factor is the geometric mean of the ratios of the quantiles at
-    50 % and 90 %, shrunk likewise towards one, and covers the error of the shift. `count` is the effective number of
-    truths.
+    r = L⁻¹ (θ − μ) of a calibrated posterior has mean zero and covariance I, and ‖r‖² has the quantiles of χ²(d). The
+    shift is the median of r; the stretch has the shape of the covariance of r, shrunk towards isotropy, and the size at
+    which the quantiles at 50 % and 90 % agree (geometric mean of their ratios). Both are shrunk towards no correction
+    by a few pseudo-observations, the stretch covers the error of the shift, and it never narrows by more than a tenth:
+    a mixture with a sharp core and wide tails has small quantiles without being too wide.
     """
 
     def whiten(mixture: GaussianMixture, truth: Array) -> Array:
         mean, tril = moment_match(mixture)
         return jax.scipy.linalg.solve_triangular(tril, truth - mean, lower=True)
 
-    d = truths.shape[-1]
-    r = jnp.clip(jax.vmap(whiten)(mixtures, truths), -5.0, 5.0)
-    trust = count / (count + 10.0)
-    shift = trust * r.mean(0)
-    squared = ((r - shift) ** 2).sum(-1)
+    n, d = truths.shape
+    r = jnp.clip(jax.vmap(whiten)(mixtures, truths), -50.0, 50.0)
+    shift = n / (n + 10.0) * jnp.median(r, axis=0)
+    centred = r - shift
+    bounded = (
+        centred * jnp.minimum(1.0, 3.0 * jnp.sqrt(d) / jnp.maximum(jnp.linalg.norm(centred, axis=-1), 1e-6))[:, None]
+    )
+    covariance = bounded.T @ bounded / n
+    size = jnp.trace(covariance) / d
+    shape = (n * covariance + 10.0 * size * jnp.eye(d)) / (n + 10.0)
+    tril = jnp.linalg.cholesky(shape + 1e-6 * jnp.eye(d))
+    tril = tril / jnp.exp(jnp.log(jnp.diagonal(tril)).mean())
+    squared = (jax.scipy.linalg.solve_triangular(tril, centred.T, lower=True) ** 2).sum(0)
     levels = jnp.array([0.5, 0.9])
     log_ratio = 0.5 * (jnp.log(jnp.quantile(squared, levels)) - jnp.log(_chi2_quantile(levels, d))).mean()
-    widen = jnp.exp(trust * log_ratio) * jnp.sqrt(1.0 + trust / jnp.maximum(count, 1.0))
-    sound = jnp.isfinite(widen) & jnp.isfinite(shift).all()
-    return Recalibration(jnp.where(sound, shift, 0.0), jnp.where(sound, widen, 1.0))
+    factor = jnp.exp(n / (n + 10.0) * jnp.maximum(log_ratio, -0.1)) * jnp.sqrt(1.0 + 1.0 / n)
+    sound = jnp.isfinite(factor) & jnp.isfinite(shift).all() & jnp.isfinite(tril).all()
+    plain = Recalibration.none(d)
+    return jax.tree.map(lambda a, b: jnp.where(sound, a, b), Recalibration(shift, factor * tril), plain)
 
 
 def _chi2_quantile(levels: Float[Array, " n"], d: int) -> Float[Array, " n"]:

@@ -46,14 +46,8 @@ class FitInfo:
     best_epoch: Int[Array, ""]
     epochs: Int[Array, ""]
     """Epochs run, at most the schedule's."""
-    coverage90: Scalar
-    """Share of held-out truths inside the 90 % credible set, before recalibration: far below 0.9 is over-confident."""
-    widen: Scalar
-    """Factor on the posterior's standard deviations that recalibration asked for."""
     overfit: Bool[Array, ""]
     """The validation score fell well below its best while the training score rose."""
-    overconfident: Bool[Array, ""]
-    """Coverage at 90 % is below 0.75 by more than chance allows (three standard errors): too far off to mend."""
     nonfinite: Int[Array, ""]
     """Updates skipped because loss or gradient was not finite."""
 
@@ -135,9 +129,6 @@ def fit(
         log_q_validation=best["validation"],
         best_epoch=best["epoch"],
         epochs=done,
-        coverage90=jnp.array(jnp.nan),
-        widen=jnp.ones(()),
         overfit=(last["validation"] < best["validation"] - 0.5) & (last["train"] > best["train"]),
-        overconfident=jnp.array(False),
         nonfinite=carry[3],
     )

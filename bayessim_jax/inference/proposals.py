@@ -1,11 +1,11 @@
-"""Proposals: where to simulate next, and how what was learned there becomes a posterior.
+"""Proposals: where to simulate next, and how the network's answer there becomes a posterior.
 
-All three obey Bayes' rule for new, independent recordings X when the network is perfect,
+The network learns q(θ | X) ∝ p̃(θ) p(X | θ) from θ drawn from the proposal p̃. For the prior p the posterior is
 
-    p(θ | X, before) ∝ q(θ | X) p(θ | before) / p̃(θ)
+    p(θ | X) ∝ q(θ | X) p(θ) / p̃(θ)
 
-with p̃ the proposal that q was trained on. They differ in p̃, in how they divide by it, and in which simulations of
-earlier rounds they can use again.
+The modes differ in p̃, in how they divide by it, in which simulations of earlier rounds they can use again, and in
+whether X is every recording so far or this round's alone.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from bayessim_jax.beliefs import GaussianMixture, Truncated, Uniform, moment_match, product, quotient, reduce
+from bayessim_jax.beliefs import GaussianMixture, Truncated, Uniform, moment_match, quotient, reduce
 from bayessim_jax.contracts import Belief, Box
 
 __all__ = ["PROPOSALS", "Corrected", "Paper", "ProposalMode", "TruncatedPrior", "lookup_proposal", "pool_weights"]
@@ -29,13 +29,15 @@ class ProposalMode(Protocol):
 
     reuse: bool
     """Whether simulations of earlier rounds are used again, weighted by `pool_weights`."""
+    accumulate: bool
+    """Whether the posterior is that of all recordings so far, recalibrated, or of this round's alone, as it comes."""
 
     def propose(self, belief: Truncated) -> Any:
         """The proposal of this round: a belief whose type never changes."""
         ...
 
     def combine(self, belief: Truncated, proposal: Any, q: GaussianMixture) -> Truncated:
-        """The posterior after this round's recordings."""
+        """The new belief from the network's answer under the proposal."""
         ...
 
 
@@ -43,30 +45,31 @@ class ProposalMode(Protocol):
 class Paper:
     """Algorithm 1 taken literally: simulate from the last posterior, and let q replace it.
 
-    p̃ is the belief, so it cancels. Only this round's simulations are usable, and a posterior that is too narrow
-    becomes the next proposal.
+    With p̃ the posterior of the rounds before and X this round's recordings that is Bayes' rule, if the network is
+    perfect. Only this round's simulations are usable, and a posterior that is too narrow becomes the next proposal.
 
     Source: Possas et al. 2020
     """
 
     reuse: bool = struct.field(pytree_node=False, default=False)
+    accumulate: bool = struct.field(pytree_node=False, default=False)
 
     def propose(self, belief: Truncated) -> Truncated:
         """The belief itself."""
         return belief
 
     def combine(self, belief: Truncated, proposal: Truncated, q: GaussianMixture) -> Truncated:
-        """The network's answer."""
-        return Truncated.create(q, belief.box)
+        """The network's answer on the prior's box."""
+        return _fitted(q, belief)
 
 
 @struct.dataclass
 class Corrected:
     """Simulate from one Gaussian, the belief's moments widened, and divide it out.
 
-    p̃ = N(m, c² S) on the prior's box, m and S the moments of the belief. Each component of the belief is narrower than
-    p̃ in every direction, so the quotient exists for each of them, is exact, and its product with q is a mixture of K²
-    Gaussians, merged to K.
+    p̃ = N(m, c² S) on the prior's box, m and S the moments of the belief. The division is exact, component by component,
+    where a component of q is narrower than p̃ in every direction; one that is not stays as it is, which is the cautious
+    reading of recordings that said less than the proposal.
 
     Source: Papamakarios and Murray 2016
     """
@@ -74,6 +77,7 @@ class Corrected:
     widening: float | Array = 2.0
     """c: standard deviations of the proposal over those of the belief."""
     reuse: bool = struct.field(pytree_node=False, default=True)
+    accumulate: bool = struct.field(pytree_node=False, default=True)
 
     def propose(self, belief: Truncated) -> Truncated:
         """The widened Gaussian; the prior itself while the belief is the prior."""
@@ -82,16 +86,17 @@ class Corrected:
         return Truncated(wide, belief.box, belief.prior_share)
 
     def combine(self, belief: Truncated, proposal: Truncated, q: GaussianMixture) -> Truncated:
-        """(belief / p̃) · q, merged to the number of components of q."""
-        fresh, _ = quotient(belief.mixture, proposal.mixture.means[0], proposal.mixture.scale_trils[0])
-        return _unless_prior(belief, q, product(fresh, q))
+        """The quotient q / p̃ on the prior's box; q itself where p̃ was the prior."""
+        divided, _ = quotient(q, proposal.mixture.means[0], proposal.mixture.scale_trils[0])
+        first = proposal.prior_share > 0.5
+        return _fitted(jax.tree.map(lambda a, b: jnp.where(first, a, b), q, divided), belief)
 
 
 @struct.dataclass
 class TruncatedPrior:
-    """Simulate from the prior cut to a box around the belief, and multiply.
+    """Simulate from the prior cut to a box around the belief.
 
-    p̃ is constant on the box, so nothing is divided out and simulations of all rounds that fall in it are alike.
+    p̃ is constant on the box, so nothing is divided out, and simulations of all rounds that fall in it are alike.
 
     Source: Deistler et al. 2022
     """
@@ -99,6 +104,7 @@ class TruncatedPrior:
     reach: float | Array = 5.0
     """Half the box, in standard deviations of the belief."""
     reuse: bool = struct.field(pytree_node=False, default=True)
+    accumulate: bool = struct.field(pytree_node=False, default=True)
 
     def propose(self, belief: Truncated) -> Uniform:
         """The prior on mean ± reach · sd."""
@@ -108,15 +114,20 @@ class TruncatedPrior:
         return Uniform(Box(low, high, belief.box.names, belief.box.units))
 
     def combine(self, belief: Truncated, proposal: Uniform, q: GaussianMixture) -> Truncated:
-        """Belief · q, merged to the number of components of q."""
-        return _unless_prior(belief, q, product(belief.mixture, q))
+        """The network's answer on the prior's box."""
+        return _fitted(q, belief)
 
 
-def _unless_prior(belief: Truncated, q: GaussianMixture, combined: GaussianMixture) -> Truncated:
-    """Q alone while the belief is the prior, the combined mixture afterwards."""
-    merged = reduce(combined, q.log_weights.shape[0])
-    first = belief.prior_share > 0.5
-    return Truncated.create(jax.tree.map(lambda a, b: jnp.where(first, a, b), q, merged), belief.box)
+def _fitted(mixture: GaussianMixture, belief: Truncated, most: int = 32) -> Truncated:
+    """A belief of the same shape: the lightest components beyond `most` are dropped, then pairs are merged."""
+    count = belief.mixture.log_weights.size
+    if mixture.log_weights.size > most:
+        _, heaviest = jax.lax.top_k(mixture.log_weights, most)
+        mixture = jax.tree.map(lambda leaf: leaf[heaviest], mixture)
+    if mixture.log_weights.size < count:
+        copies = -(-count // mixture.log_weights.size)
+        mixture = jax.tree.map(lambda leaf: jnp.repeat(leaf, copies, axis=0), mixture)
+    return Truncated.create(reduce(mixture, count), belief.box)
 
 
 def pool_weights(

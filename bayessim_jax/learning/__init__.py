@@ -28,9 +28,9 @@ __all__ = [
 LEARNERS: dict[str, Any] = {"ppo": Ppo, "sac": Sac}
 
 DEFAULTS: dict[str, tuple[str, dict[str, Any]]] = {
-    "cartpole": ("ppo", {"episodes": 30, "episode_steps": 500}),
+    "cartpole": ("ppo", {"episodes": 30, "episode_steps": 500, "gamma": 0.998}),
     "pendulum": ("sac", {"episodes": 75, "episode_steps": 200, "entropy_target": -3.0}),
-    "acrobot": ("ppo", {"episodes": 30, "episode_steps": 500}),
+    "acrobot": ("ppo", {"episodes": 30, "episode_steps": 500, "gamma": 0.995}),
 }
 """For each registered system: its learner, and the settings that learn its task in 15,000 policy steps a round.
 

@@ -123,8 +123,9 @@ def _calibration(run: OnlineRun) -> list[str]:
     flags = [np.nan_to_num(run.series(name)) > 0 for name in ("overfit", "overconfident")]
     svg = coverage_plot(run.series("coverage90"), run.series("log_q_train"), run.series("log_q_validation"), *flags)
     caption = (
-        "Left: how many of the simulations that were kept out of training lie inside their own 90 % credible set; far "
-        "below the dashed line, the posterior is over-confident. Right: the score on simulations trained on and held "
+        "Left: how many of the simulated sets that were kept out of training lie inside their own 90 % credible set "
+        "before recalibration takes the difference out; far below the dashed line, little can be mended. Right: the "
+        "score on simulations trained on and held "
         "out; a widening gap is over-fitting. Orange crosses mark rounds that raised a flag."
     )
     parts = [html.figure(svg, "Coverage on held-out simulations and fit scores against rounds.", caption, wide=True)]

@@ -91,8 +91,8 @@ def worries(run: OnlineRun) -> list[str]:
     if (n := int(np.nansum(at("overconfident")))) > 0:
         share = float(np.nanmin(at("coverage90")))
         found.append(
-            f"The posterior is over-confident{_in(n, several)}: only {share:.0%} of the held-out simulations lie "
-            "inside their 90 % credible set, so the ± above is too small."
+            f"The estimator is over-confident{_in(n, several)}: only {share:.0%} of the held-out simulations lie "
+            "inside their 90 % credible set before recalibration, so the ± above may be too small."
         )
     if (n := int(np.nansum(at("overfit")))) > 0:
         found.append(

@@ -15,10 +15,15 @@ class Fit:
     log_q_train: jax.Array
     log_q_validation: jax.Array
     best_epoch: jax.Array
-    coverage90: jax.Array
     overfit: jax.Array
-    overconfident: jax.Array
     nonfinite: jax.Array
+
+
+@struct.dataclass
+class Calibration:
+    coverage90: jax.Array
+    widen: jax.Array
+    overconfident: jax.Array
 
 
 @struct.dataclass
@@ -55,10 +60,11 @@ def one_info(system, index, truth, steps=5, recordings=2, **flags):
             log_q_train=jnp.array(1.0 * index),
             log_q_validation=jnp.array(flags.get("log_q_validation", 0.9 * index)),
             best_epoch=jnp.array(100),
-            coverage90=jnp.array(0.9),
             overfit=flag("overfit"),
-            overconfident=flag("overconfident"),
             nonfinite=jnp.array(0),
+        ),
+        calibration=Calibration(
+            coverage90=jnp.array(0.9), widen=jnp.array(1.1), overconfident=flag("overconfident")
         ),
         learning=Learning(return_mean=jnp.array(10.0 * index), nonfinite=jnp.array(0)),
         return_target=jnp.array(20.0 * index),

@@ -1,0 +1,12 @@
+"""Compiled code is kept between runs of the tests: most of their time is compilation."""
+
+import os
+from pathlib import Path
+
+import jax
+
+jax.config.update(
+    "jax_compilation_cache_dir",
+    os.environ.get("BAYESSIM_TEST_CACHE", str(Path(__file__).parent.parent / ".bayessim_cache")),
+)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

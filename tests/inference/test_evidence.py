@@ -1,0 +1,58 @@
+import jax
+import jax.numpy as jnp
+
+from bayessim_jax.beliefs import GaussianMixture
+from bayessim_jax.inference.evidence import combine_evidence, credible_level, recalibrate
+
+
+def _posteriors(key, theta, sd):
+    """Exact posteriors N((θ̂/s²)/(1 + 1/s²), 1/(1 + 1/s²)) of single measurements of a standard normal parameter."""
+    measured = theta + sd[:, None] * jax.random.normal(key, (sd.size, theta.size))
+    precision = 1 + 1 / sd**2
+    means = measured / (sd**2 * precision)[:, None]
+    trils = jnp.eye(theta.size) / jnp.sqrt(precision)[:, None, None]
+    mixtures = GaussianMixture(jnp.zeros((sd.size, 1)), means[:, None], trils[:, None])
+    return measured, mixtures
+
+
+def test_combined_evidence_is_the_conjugate_posterior_of_all_measurements():
+    sd = jnp.array([0.5, 1.0, 2.0, 0.7])
+    measured, each = _posteriors(jax.random.key(0), jnp.array([0.3, -0.8]), sd)
+    combined = combine_evidence(each, jnp.ones(4, bool))
+    precision = 1 + (1 / sd**2).sum()
+    assert jnp.allclose(combined.means[0], (measured / sd[:, None] ** 2).sum(0) / precision, atol=1e-5)
+    assert jnp.allclose(combined.covariance(), jnp.eye(2) / precision, atol=1e-5)
+
+
+def test_a_recording_that_is_not_used_changes_nothing():
+    sd = jnp.array([0.5, 1.0, 2.0, 0.7])
+    _, each = _posteriors(jax.random.key(0), jnp.zeros(2), sd)
+    some = combine_evidence(each, jnp.array([True, True, True, False]))
+    fewer = combine_evidence(jax.tree.map(lambda leaf: leaf[:3], each), jnp.ones(3, bool))
+    assert jnp.allclose(some.means, fewer.means) and jnp.allclose(some.scale_trils, fewer.scale_trils)
+
+
+def test_recalibration_undoes_a_known_bias_and_overconfidence():
+    n, d = 4000, 2
+    keys = jax.random.split(jax.random.key(1), 2)
+    tril = jnp.array([[0.5, 0.0], [0.3, 0.2]])
+    means = jax.random.normal(keys[0], (n, d))
+    truths = means + jax.random.normal(keys[1], (n, d)) @ tril.T
+    stated = GaussianMixture(
+        jnp.zeros((n, 1)), (means + tril @ jnp.array([0.4, -0.2]))[:, None], jnp.broadcast_to(tril / 2, (n, 1, d, d))
+    )
+    found = recalibrate(stated, truths)
+    assert jnp.allclose(found.shift, -2 * jnp.array([0.4, -0.2]), atol=0.1)
+    assert jnp.allclose(jnp.diagonal(found.stretch), 2.0, atol=0.15)
+    corrected = jax.vmap(found.apply)(stated)
+    level = credible_level(jax.random.key(2), corrected, truths)
+    assert abs(float((level <= 0.9).mean()) - 0.9) < 0.02 and abs(float((level <= 0.5).mean()) - 0.5) < 0.03
+
+
+def test_recalibration_leaves_a_calibrated_posterior_alone():
+    n = 2000
+    means = jax.random.normal(jax.random.key(3), (n, 3))
+    truths = means + jax.random.normal(jax.random.key(4), (n, 3))
+    stated = GaussianMixture(jnp.zeros((n, 1)), means[:, None], jnp.broadcast_to(jnp.eye(3), (n, 1, 3, 3)))
+    found = recalibrate(stated, truths)
+    assert jnp.abs(found.shift).max() < 0.08 and jnp.allclose(found.stretch, jnp.eye(3), atol=0.1)

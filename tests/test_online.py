@@ -1,0 +1,163 @@
+"""The outer loop: the same run however it is cut, and nothing silent."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from bayessim_jax import online
+from bayessim_jax.contracts import Box
+from bayessim_jax.engines.simulated import SimulatedTarget
+from bayessim_jax.inference import Lstm, MixtureHead, Schedule, recurrent_mixture
+from bayessim_jax.inference.estimators import MixtureDensity
+from bayessim_jax.learning import Fixed, Ppo, RandomPolicy
+from bayessim_jax.systems import Balance, CartPole, from_functions
+
+TINY = MixtureDensity(Lstm(8, 4), MixtureHead(2, 8), Schedule(epochs=10, draws=32, batch=16), members=1, folds=4)
+
+
+@pytest.fixture(scope="module")
+def cartpole():
+    system, task = CartPole.create(), Balance(steps=30)
+    learner = Ppo.create(system, task, episodes=8, episode_steps=16)
+    setup = online.Setup.create(
+        system,
+        learner,
+        task,
+        estimator=TINY,
+        steps=16,
+        simulations=32,
+        evaluations=2,
+        pool=2,
+        components=2,
+        history=4,
+        calibrations=16,
+    )
+    return setup, SimulatedTarget(system, task, jnp.array([0.4, 0.6]))
+
+
+@pytest.fixture(scope="module")
+def run():
+    return jax.jit(online.run, static_argnames="rounds")
+
+
+def _same(a, b):
+    leaves = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return all(bool(jnp.array_equal(x, y, equal_nan=jnp.issubdtype(x.dtype, jnp.floating))) for x, y in leaves)
+
+
+def test_chunks_and_a_python_loop_are_the_whole_run_bit_for_bit(cartpole, run):
+    setup, target = cartpole
+    key = jax.random.key(3)
+    init_key, target_key, update_key, _ = jax.random.split(key, 4)
+    start = jax.jit(online.init)(init_key, setup)
+    whole, infos = run(key, setup, target, start, rounds=4)
+    assert int(whole.round) == 4
+
+    state, chunks = start, []
+    for _ in range(2):
+        state, info = run(key, setup, target, state, rounds=2)
+        chunks.append(info)
+    assert _same(whole, state)
+    assert _same(infos, jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *chunks))
+
+    state, record, update = start, jax.jit(online.record), jax.jit(online.update)
+    for _ in range(4):
+        state, _ = update(update_key, setup, state, record(target_key, setup, target, state))
+    assert _same(whole, state)
+
+
+def test_seeds_batch_and_a_new_truth_does_not_recompile(cartpole):
+    setup, target = cartpole
+    traces = []
+
+    @jax.jit
+    def several(keys, thetas):
+        traces.append(None)
+        return jax.vmap(lambda k, t: online.run(k, setup, target.replace(theta=t), rounds=2))(keys, thetas)
+
+    keys = jax.random.split(jax.random.key(0), 3)
+    state, infos = several(keys, jnp.array([[0.4, 0.6], [0.2, 0.3], [0.9, 0.9]]))
+    several(keys, jnp.array([[0.5, 0.6], [0.3, 0.3], [0.8, 0.9]]))
+    assert len(traces) == 1
+    assert infos.fit.log_q_validation.shape == (3, 2)
+    assert jnp.isfinite(state.belief.mixture.means).all()
+    assert not _same(jax.tree.map(lambda x: x[0], state.belief), jax.tree.map(lambda x: x[1], state.belief))
+
+
+def test_a_state_is_a_legal_carry(cartpole):
+    setup, _ = cartpole
+    state = jax.eval_shape(online.init, jax.random.key(0), setup)
+    recordings = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((1, *leaf.shape[1:]), leaf.dtype), state.history)
+    after, _ = jax.eval_shape(online.update, jax.random.key(0), setup, state, recordings)
+    assert jax.tree.structure(state) == jax.tree.structure(after)
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), state) == jax.tree.map(lambda x: (x.shape, x.dtype), after)
+
+
+def _broken_system(limit):
+    """x' = θ x, and NaN as soon as θ is above a limit."""
+    return from_functions(
+        parameters=Box.create(rate=(0.1, 1.0, "1/s")),
+        observations=Box.create(x=(-1.0, 1.0, "m")),
+        actions=Box.create(u=(-1.0, 1.0, "N")),
+        noise=0.01,
+        dt=0.1,
+        reset=lambda key, theta: jax.random.uniform(key, (1,)),
+        step=lambda theta, x, u: jnp.where(theta[0] > limit, jnp.nan, 0.9 * x + 0.1 * theta * u),
+    )
+
+
+def test_diverged_simulations_are_counted_and_never_averaged_in():
+    system = _broken_system(0.7)
+    setup = online.Setup.create(
+        system,
+        Fixed(RandomPolicy(system.actions)),
+        estimator=TINY,
+        steps=12,
+        simulations=64,
+        pool=2,
+        components=2,
+        history=4,
+        calibrations=16,
+    )
+    target = SimulatedTarget(system, None, jnp.array([0.3]))
+    state, infos = jax.jit(online.run, static_argnames="rounds")(jax.random.key(0), setup, target, rounds=2)
+    assert 8 < int(infos.diverged[0]) < 40
+    assert int(infos.fit.nonfinite.sum()) == 0
+    assert jnp.isfinite(state.belief.log_prob(jnp.array([0.3])))
+    assert jnp.isfinite(jnp.concatenate([x.ravel() for x in jax.tree.leaves(state.estimator)])).all()
+
+
+def test_a_target_that_diverges_leaves_the_belief_alone():
+    system = _broken_system(0.7)
+    setup = online.Setup.create(
+        system,
+        Fixed(RandomPolicy(system.actions)),
+        estimator=TINY,
+        steps=12,
+        simulations=64,
+        pool=2,
+        components=2,
+        history=4,
+        calibrations=16,
+    )
+    state = online.init(jax.random.key(0), setup)
+    target = SimulatedTarget(system, None, jnp.array([0.9]))
+    recordings = online.record(jax.random.key(1), setup, target, state)
+    assert bool(recordings.diverged.all())
+    after, _ = jax.jit(online.update)(jax.random.key(2), setup, state, recordings)
+    assert _same(after.belief, state.belief)
+
+
+def test_wrong_shapes_and_sizes_are_told_in_one_line(cartpole):
+    setup, _ = cartpole
+    with pytest.raises(ValueError, match="simulations is 0"):
+        online.Setup.create(setup.system, setup.learner, simulations=0)
+    state = online.init(jax.random.key(0), setup)
+    recordings = jax.tree.map(lambda leaf: leaf[:3], state.history)
+    with pytest.raises(ValueError, match=r"shape \(3, 16\)"):
+        online.update(jax.random.key(0), setup, state, recordings)
+
+
+def test_the_default_estimator_is_the_recurrent_mixture(cartpole):
+    setup, _ = cartpole
+    assert online.Setup.create(setup.system, setup.learner).estimator == recurrent_mixture()
