@@ -15,6 +15,7 @@ Source: Possas et al. 2020, Algorithm 1
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -204,8 +205,8 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
     simulated = simulate(simulate_key, setup, state.learner, thetas[:fresh], 1)
     pool = _insert(state.pool, state.round, thetas[:fresh], simulated, proposal)
     weights = pool_weights(pool.thetas, pool.proposals, pool.filled, proposal).ravel()
-    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (pool.thetas, pool.recordings))
-    estimator, fit = setup.estimator.fit(fit_key, state.estimator, *flat, weights)
+    points, singles = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (pool.thetas, pool.recordings))
+    estimator, fit = setup.estimator.fit(fit_key, state.estimator, points, singles, weights)
 
     # the posterior of everything the target has shown
     history, use = _remember(state.history, state.round, recordings)
@@ -242,7 +243,7 @@ def run(
     def one_round(state: State, _: None) -> tuple[State, RoundInfo]:
         recordings = record(target_key, setup, target, state)
         state, info = update(update_key, setup, state, recordings)
-        return state, info.replace(return_target=evaluate(evaluate_key, setup, target, state))
+        return state, replace(info, return_target=evaluate(evaluate_key, setup, target, state))
 
     return jax.lax.scan(one_round, init(init_key, setup) if state is None else state, None, length=rounds)
 

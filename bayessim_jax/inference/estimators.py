@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -127,7 +128,7 @@ class MixtureDensity:
         # one after the other: batched small matrix products are slower than a loop on a CPU
         keys = jax.random.split(key, self.members)
         params, infos = jax.lax.map(member, (jnp.arange(self.members), keys, state.params))
-        state = state.replace(params=params)
+        state = replace(state, params=params)
 
         units = jnp.log(state.scale).sum()
         return state, FitInfo(
@@ -150,11 +151,11 @@ class MixtureDensity:
         """Measure the posterior of sets on sets that no network has seen, and take out what is wrong with it."""
         z = (thetas - state.shift) / state.scale
         x, valid = self._inputs(state, recordings)
-        plain = jax.lax.map(lambda one: self._combined(state.params, *one, use), (x, valid & use[:, None]))
+        plain = jax.lax.map(lambda one: self._combined(state.params, one[0], one[1], use), (x, valid & use[:, None]))
         recalibration = recalibrate(plain, z)
         coverage = (credible_level(key, plain, z) <= 0.9).mean()
         chance = 3 * jnp.sqrt(0.9 * 0.1 / z.shape[0])
-        return state.replace(recalibration=recalibration), CalibrationInfo(
+        return replace(state, recalibration=recalibration), CalibrationInfo(
             coverage90=coverage,
             widen=jnp.exp(jnp.log(jnp.diagonal(recalibration.stretch)).mean()),
             overconfident=coverage < 0.5 - chance,
@@ -206,7 +207,8 @@ class MixtureDensity:
             state.params["head"], (shift - state.shift) / state.scale, spread / state.scale
         )
         head = jax.tree.map(lambda new, old: jnp.where(state.fitted, new, old), head, state.params["head"])
-        return state.replace(
+        return replace(
+            state,
             params=state.params | {"head": head},
             feature_mean=keep(state.feature_mean, mean),
             feature_scale=keep(state.feature_scale, scale),

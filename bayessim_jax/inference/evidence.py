@@ -70,7 +70,7 @@ def recalibrate(mixtures: GaussianMixture, truths: Float[Array, "n d"]) -> Recal
     r = L⁻¹ (θ − μ) of a calibrated posterior has mean zero and covariance I, and ‖r‖² has the quantiles of χ²(d). The
     shift is the median of r; the stretch has the shape of the covariance of r, shrunk towards isotropy, and the size at
     which the quantiles at 50 % and 90 % agree (geometric mean of their ratios). Both are shrunk towards no correction
-    by a few pseudo-observations, the stretch covers the error of the shift, and it never narrows by more than a tenth:
+    by a few pseudo-observations, the stretch covers the error of the shift, and it never narrows:
     a mixture with a sharp core and wide tails has small quantiles without being too wide.
     """
 
@@ -93,7 +93,7 @@ def recalibrate(mixtures: GaussianMixture, truths: Float[Array, "n d"]) -> Recal
     squared = (jax.scipy.linalg.solve_triangular(tril, centred.T, lower=True) ** 2).sum(0)
     levels = jnp.array([0.5, 0.9])
     log_ratio = 0.5 * (jnp.log(jnp.quantile(squared, levels)) - jnp.log(_chi2_quantile(levels, d))).mean()
-    factor = jnp.exp(n / (n + 10.0) * jnp.maximum(log_ratio, -0.1)) * jnp.sqrt(1.0 + 1.0 / n)
+    factor = jnp.exp(n / (n + 10.0) * jnp.maximum(log_ratio, 0.0)) * jnp.sqrt(1.0 + 1.0 / n)
     sound = jnp.isfinite(factor) & jnp.isfinite(shift).all() & jnp.isfinite(tril).all()
     plain = Recalibration.none(d)
     return jax.tree.map(lambda a, b: jnp.where(sound, a, b), Recalibration(shift, factor * tril), plain)

@@ -37,7 +37,7 @@ class Acrobot:
     parameters: Box
     observations: Box
     noise: Float[Array, " obs"]
-    actions: Discrete = struct.field(pytree_node=False, default=Discrete(3, ("torque",), ("index",)))
+    actions: Box | Discrete = struct.field(pytree_node=False, default=Discrete(3, ("torque",), ("index",)))
     dt: float = struct.field(pytree_node=False, default=0.2)
 
     @classmethod

@@ -38,7 +38,7 @@ class CartPole:
     parameters: Box
     observations: Box
     noise: Float[Array, " obs"]
-    actions: Discrete = struct.field(pytree_node=False, default=Discrete(2, ("push",), ("index",)))
+    actions: Box | Discrete = struct.field(pytree_node=False, default=Discrete(2, ("push",), ("index",)))
     dt: float = struct.field(pytree_node=False, default=0.02)
 
     @classmethod

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from bayessim_jax.contracts import Box, Scalar
+from bayessim_jax.contracts import Box, Discrete, Scalar
 
 __all__ = ["Pendulum", "PendulumState", "SwingUp"]
 
@@ -33,7 +33,7 @@ class Pendulum:
 
     parameters: Box
     observations: Box
-    actions: Box
+    actions: Box | Discrete
     noise: Float[Array, " obs"]
     dt: float = struct.field(pytree_node=False, default=0.05)
 

@@ -63,9 +63,7 @@ def one_info(system, index, truth, steps=5, recordings=2, **flags):
             overfit=flag("overfit"),
             nonfinite=jnp.array(0),
         ),
-        calibration=Calibration(
-            coverage90=jnp.array(0.9), widen=jnp.array(1.1), overconfident=flag("overconfident")
-        ),
+        calibration=Calibration(coverage90=jnp.array(0.9), widen=jnp.array(1.1), overconfident=flag("overconfident")),
         learning=Learning(return_mean=jnp.array(10.0 * index), nonfinite=jnp.array(0)),
         return_target=jnp.array(20.0 * index),
         diverged=jnp.array(0),
