@@ -47,8 +47,10 @@ class Plan:
 
     def start(self) -> online.State:
         """The state of every seed before the first round, with a leading axis over the seeds."""
-        first = lambda key: online.init(jax.random.split(key, 4)[0], self.setup)  # noqa: E731
-        return jax.jit(_over_seeds(first, len(self.seeds)))(self.keys)
+        first = jax.jit(lambda setup, key: online.init(jax.random.split(key, 4)[0], setup))
+        # one after the other: XLA's batched QR, of orthogonal initial weights, can deadlock on a CPU with few cores
+        states = [first(self.setup, key) for key in self.keys]
+        return jax.tree.map(lambda *leaves: jax.numpy.stack(leaves), *states)
 
     def compile(self, states: online.State) -> Callable[[online.State], tuple[online.State, online.RoundInfo]]:
         """One round of all seeds as compiled functions of their states, the same round that `online.run` does.

@@ -65,9 +65,10 @@ def _several(run: OnlineRun) -> str:
     parts = [f"{name} by {number(e, 2)}{' ' + unit if unit else ''}" for name, unit, e in pairs]
     log_prob, gain = run.series("log_prob_true")[:, -1], run.series("gain_over_prior")[:, -1]
     own = ", each with its own truth," if len(np.unique(run.truths, axis=0)) > 1 else ""
+    side = "above" if np.mean(gain) >= 0 else "below"
     return (
         f"{seeds}{own} the posterior mean misses (median) {_join(parts)}; log q(θ*) is "
-        f"{number(float(np.mean(log_prob)))} on average, {number(float(np.mean(gain)))} above the prior"
+        f"{number(float(np.mean(log_prob)))} on average, {number(abs(float(np.mean(gain))))} {side} the prior"
     )
 
 

@@ -225,6 +225,20 @@ def test_the_command_does_what_the_library_does(tmp_path):
 
 
 @pytest.mark.slow
+def test_several_seeds_at_once(tmp_path):
+    (tmp_path / "tiny.toml").write_text(TINY)
+    words = ["--seed", "6", "--seeds", "3", "--rounds", "2", "--quiet", "--out", str(tmp_path / "run")]
+    assert main(["online", "--config", str(tmp_path / "tiny.toml"), *words]) == 0
+    told = lines(tmp_path / "run")
+    assert [(line["round"], line["seed"]) for line in told] == [(r, s) for r in (1, 2) for s in (6, 7, 8)]
+    assert len({line["log_prob_true"] for line in told}) == 6
+    with xr.open_datatree(tmp_path / "run" / "posterior.nc", engine="h5netcdf") as tree:
+        assert len(set(tree["posterior"]["length"].attrs["truth"])) == 3
+        x = tree["observed_data"]["x"].values
+    assert len({float(first) for first in x[0, :, 0, 0]}) == 3
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_a_process_that_is_stopped_goes_on_as_if_it_had_not_been(tmp_path, number):
     (tmp_path / "tiny.toml").write_text(TINY.replace("rounds = 3", "rounds = 40"))

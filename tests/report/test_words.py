@@ -43,6 +43,7 @@ def test_several_seeds_are_summed_up():
     text = headline(made_up(seeds=9, rounds=4))
     assert "9 seeds, each with its own truth" in text
     assert "above the prior" in text
+    assert "0.500 below the prior" in headline(made_up(seeds=3, rounds=2, gain_over_prior=-0.5))
     assert headline(made_up(seeds=3, rounds=4, known=False)).count("over the seeds") == 2
 
 
