@@ -129,6 +129,6 @@ def fit(
         log_q_validation=best["validation"],
         best_epoch=best["epoch"],
         epochs=done,
-        overfit=(last["validation"] < best["validation"] - 0.5) & (last["train"] > best["train"]),
+        overfit=(last["validation"] < best["validation"] - 1.0) & (last["train"] > best["train"]),
         nonfinite=carry[3],
     )

@@ -10,7 +10,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bayessim_jax.contracts import Belief, Scalar, System, Task
-from bayessim_jax.learning.heads import draw, normal
+from bayessim_jax.learning.heads import Head, draw, normal
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -88,21 +88,21 @@ def collect(
     task: Task[Any],
     belief: Belief,
     worlds: Worlds,
-    choose: Callable[[Any, Any], tuple[Any, Any]],
-    chance: int,
+    head: Head,
+    outputs: Callable[[Float[Array, "worlds obs"]], Float[Array, "worlds outputs"]],
     steps: int,
     episode_steps: int,
 ) -> tuple[Worlds, Transitions, Episodes]:
-    """Let `choose(observations, uniforms) -> (raw, actions)` act; it gets `chance` uniform numbers for each world.
+    """Act by the head's samples, given the network's `outputs` for what all worlds show.
 
     Episodes end by the task, after `episode_steps` steps or where a number is not finite; the next one begins with a
     new θ at once.
     """
     count, obs = worlds.observation.shape
-    fresh_key, chance_key = jax.random.split(key)
-    uniforms = draw(chance_key, (steps + 1, count, chance + 2 * obs))
-    looks = normal(uniforms[..., chance:])
-    fresh = begin(fresh_key, system, belief, looks[..., :obs])
+    fresh_key, noise_key = jax.random.split(key)
+    uniforms = draw(noise_key, (steps + 1, count, head.chances + 2 * obs))
+    noise, looks = head.noise(uniforms[1:, :, : head.chances]), normal(uniforms[:, :, head.chances :])
+    fresh = begin(fresh_key, system, belief, looks[:, :, :obs])
     first, fresh = jax.tree.map(lambda x: x[0], fresh), jax.tree.map(lambda x: x[1:], fresh)
     worlds = _where(worlds.age < 0, first, worlds)
 
@@ -111,8 +111,9 @@ def collect(
         return after, system.observe(theta, after), task.reward(state, action, after), task.terminated(after)
 
     def step(worlds: Worlds, x: Any) -> Any:
-        uniform, look, fresh = x
-        raw, action = choose(worlds.observation, uniform)
+        noise, look, fresh = x
+        raw = jax.vmap(head.sample)(outputs(worlds.observation), noise)
+        action = jax.vmap(head.action)(raw)
         state, clean, reward, terminated = jax.vmap(advance)(worlds.theta, worlds.state, action)
         observation = clean + system.noise * look
         sound = jnp.isfinite(observation).all(-1) & jnp.isfinite(reward) & jnp.isfinite(raw).all(-1)

@@ -1,7 +1,7 @@
 """Action distributions: what a policy network's outputs mean.
 
 A head turns `outputs` numbers into a distribution over raw actions and a raw action into the vector that a system
-takes. Chance is an argument, numbers uniform in (0, 1), so that a learner can draw it for a whole batch at once.
+takes. Noise is an argument, so that a learner can draw it for a whole round at once.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from bayessim_jax.contracts import Box, Discrete, Scalar
 __all__ = ["Categorical", "Gaussian", "Head", "SquashedGaussian", "choose_head", "draw", "normal"]
 
 _HALF_LOG_2PI = 0.9189385332046727
+_LOG_2 = 0.6931471805599453
 
 
 class Head(Protocol):
@@ -30,11 +31,15 @@ class Head(Protocol):
         ...
 
     @property
-    def chance(self) -> int:
-        """Uniform numbers it makes an action of."""
+    def chances(self) -> int:
+        """Numbers of noise that it makes an action of."""
         ...
 
-    def sample(self, p: Float[Array, " outputs"], uniform: Float[Array, " chance"]) -> Float[Array, " act"]:
+    def noise(self, uniform: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Noise from uniform numbers in (0, 1), one from each."""
+        ...
+
+    def sample(self, p: Float[Array, " outputs"], noise: Float[Array, " chances"]) -> Float[Array, " act"]:
         """A raw action."""
         ...
 
@@ -67,13 +72,17 @@ class Categorical:
         return self.count
 
     @property
-    def chance(self) -> int:
+    def chances(self) -> int:
         """One number for each index."""
         return self.count
 
-    def sample(self, p: Float[Array, " count"], uniform: Float[Array, " count"]) -> Float[Array, " 1"]:
-        """The index of the largest p plus Gumbel noise, −log(−log uniform)."""
-        return self.mode(p - jnp.log(-jnp.log(uniform)))
+    def noise(self, uniform: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Gumbel numbers, −log(−log uniform)."""
+        return -jnp.log(-jnp.log(uniform))
+
+    def sample(self, p: Float[Array, " count"], noise: Float[Array, " count"]) -> Float[Array, " 1"]:
+        """The index of the largest p + noise."""
+        return self.mode(p + noise)
 
     def mode(self, p: Float[Array, " count"]) -> Float[Array, " 1"]:
         """The index of the largest logit."""
@@ -107,14 +116,18 @@ class Gaussian:
         return 2 * self.box.size
 
     @property
-    def chance(self) -> int:
+    def chances(self) -> int:
         """One number for each axis."""
         return self.box.size
 
-    def sample(self, p: Float[Array, " outputs"], uniform: Float[Array, " act"]) -> Float[Array, " act"]:
+    def noise(self, uniform: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Standard normal numbers."""
+        return normal(uniform)
+
+    def sample(self, p: Float[Array, " outputs"], noise: Float[Array, " act"]) -> Float[Array, " act"]:
         """Mean plus scaled noise, not yet clipped."""
         mean, log_std = _split(p)
-        return mean + jnp.exp(log_std) * normal(uniform)
+        return mean + jnp.exp(log_std) * noise
 
     def mode(self, p: Float[Array, " outputs"]) -> Float[Array, " act"]:
         """The mean."""
@@ -151,14 +164,18 @@ class SquashedGaussian:
         return 2 * self.box.size
 
     @property
-    def chance(self) -> int:
+    def chances(self) -> int:
         """One number for each axis."""
         return self.box.size
 
-    def sample(self, p: Float[Array, " outputs"], uniform: Float[Array, " act"]) -> Float[Array, " act"]:
+    def noise(self, uniform: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Standard normal numbers."""
+        return normal(uniform)
+
+    def sample(self, p: Float[Array, " outputs"], noise: Float[Array, " act"]) -> Float[Array, " act"]:
         """Mean plus scaled noise, before tanh."""
         mean, log_std = _bounded(p)
-        return mean + jnp.exp(log_std) * normal(uniform)
+        return mean + jnp.exp(log_std) * noise
 
     def mode(self, p: Float[Array, " outputs"]) -> Float[Array, " act"]:
         """The mean, before tanh."""
@@ -167,8 +184,9 @@ class SquashedGaussian:
     def log_prob(self, p: Float[Array, " outputs"], raw: Float[Array, " act"]) -> Scalar:
         """Log density of tanh a."""
         mean, log_std = _bounded(p)
-        normal = -0.5 * ((raw - mean) * jnp.exp(-log_std)) ** 2 - log_std - _HALF_LOG_2PI
-        return jnp.sum(normal - 2.0 * (jnp.log(2.0) - raw - jax.nn.softplus(-2.0 * raw)))
+        gaussian = -0.5 * ((raw - mean) * jnp.exp(-log_std)) ** 2 - log_std - _HALF_LOG_2PI
+        size = jnp.abs(raw)
+        return jnp.sum(gaussian - 2.0 * (_LOG_2 - size - jnp.log1p(jnp.exp(-2.0 * size))))
 
     def entropy(self, p: Float[Array, " outputs"]) -> Scalar:
         """Of the Gaussian before tanh, in nats; the squashed one has no closed form."""

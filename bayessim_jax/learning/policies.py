@@ -35,4 +35,5 @@ class NetworkPolicy:
         outputs: Any = self.network.apply(self.weights, self.scaling.normalise(observation))
         if self.deterministic:
             return self.head.action(self.head.mode(outputs)), memory
-        return self.head.action(self.head.sample(outputs, draw(key, (self.head.chance,)))), memory
+        noise = self.head.noise(draw(key, (self.head.chances,)))
+        return self.head.action(self.head.sample(outputs, noise)), memory

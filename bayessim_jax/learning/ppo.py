@@ -157,19 +157,14 @@ class Ppo:
 
         def iterate(carry: Any, keys: PRNGKeyArray) -> Any:
             state, worlds, sums = carry
-
-            def choose(observations: Any, uniforms: Any) -> Any:
-                raw = jax.vmap(self.head.sample)(self._outputs(state.weights, observations), uniforms)
-                return raw, jax.vmap(self.head.action)(raw)
-
             worlds, transitions, episodes = collect(
                 keys[0],
                 self.system,
                 self.task,
                 belief,
                 worlds,
-                choose,
-                self.head.chance,
+                self.head,
+                lambda observations: self._outputs(state.weights, observations),
                 self.horizon,
                 self.episode_steps,
             )

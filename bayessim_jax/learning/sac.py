@@ -165,19 +165,14 @@ class Sac:
 
         def iterate(carry: Any, keys: PRNGKeyArray) -> Any:
             state, worlds, sums = carry
-
-            def choose(observations: Any, uniforms: Any) -> Any:
-                raw = jax.vmap(self.head.sample)(self._outputs(state.weights["policy"], observations), uniforms)
-                return raw, jax.vmap(self.head.action)(raw)
-
             worlds, seen, episodes = collect(
                 keys[0],
                 self.system,
                 self.task,
                 belief,
                 worlds,
-                choose,
-                self.head.chance,
+                self.head,
+                lambda observations: self._outputs(state.weights["policy"], observations),
                 self.horizon,
                 self.episode_steps,
             )
@@ -214,10 +209,10 @@ class Sac:
     def _outputs(self, weights: Any, observations: Any) -> Any:
         return self.network.apply(weights, self.scaling.normalise(observations))
 
-    def _act(self, weights: Any, seen: Any, uniform: Any) -> Any:
+    def _act(self, weights: Any, seen: Any, noise: Any) -> Any:
         """Squashed actions and their log density, for normalised observations."""
         outputs: Any = self.network.apply(weights, seen)
-        raw = jax.vmap(self.head.sample)(outputs, uniform)
+        raw = jax.vmap(self.head.sample)(outputs, noise)
         return jnp.tanh(raw), jax.vmap(self.head.log_prob)(outputs, raw)
 
     def _values(self, critics: Any, seen: Any, action: Any) -> Any:
@@ -230,11 +225,11 @@ class Sac:
         obs, act = self.system.observations.size, self.head.box.size
         flat, unravel = ravel_pytree(state.weights)
         _, unravel_slow = ravel_pytree(state.weights["critics"])
-        sample_key, chance_key = jax.random.split(key)
+        sample_key, noise_key = jax.random.split(key)
         batches = state.replay.sample(sample_key, (self.updates, self.batch))
-        chances = draw(chance_key, (self.updates, 2, self.batch, self.head.chance))
+        noises = self.head.noise(draw(noise_key, (self.updates, 2, self.batch, self.head.chances)))
 
-        def loss(flat: Any, slow: Any, batch: Any, chance: Any) -> Any:
+        def loss(flat: Any, slow: Any, batch: Any, noise: Any) -> Any:
             weights, frozen = unravel(flat), unravel(jax.lax.stop_gradient(flat))
             seen, action = batch[:, :obs], batch[:, obs : obs + act]
             after, rest = batch[:, obs + act : 2 * obs + act], batch[:, 2 * obs + act :]
@@ -242,13 +237,13 @@ class Sac:
             mean = lambda x: jnp.sum(sound * x) / jnp.maximum(jnp.sum(sound), 1.0)  # noqa: E731
             temperature = jnp.exp(frozen["log_temperature"])
 
-            next_action, next_log_prob = self._act(frozen["policy"], after, chance[0])
+            next_action, next_log_prob = self._act(frozen["policy"], after, noise[0])
             ahead = jnp.min(self._values(unravel_slow(slow), after, next_action), -1) - temperature * next_log_prob
             target = reward + self.gamma * (1.0 - terminated) * ahead
             error = self._values(weights["critics"], seen, action) - target[:, None]
             value_loss = mean(jnp.sum(error**2, -1)) / 2
 
-            chosen, log_prob = self._act(weights["policy"], seen, chance[1])
+            chosen, log_prob = self._act(weights["policy"], seen, noise[1])
             policy_loss = mean(temperature * log_prob - jnp.min(self._values(frozen["critics"], seen, chosen), -1))
             surplus = jax.lax.stop_gradient(mean(log_prob)) + self.entropy_target
             total = value_loss + policy_loss - weights["log_temperature"] * surplus
@@ -265,5 +260,5 @@ class Sac:
             carry = jax.tree.map(lambda a, b: jnp.where(taken, a, b), (moved, followed, after), carry)
             return carry, (*(jnp.where(taken, x, 0.0) for x in info), ~taken)
 
-        (flat, slow, moments), info = jax.lax.scan(update, (flat, state.slow, state.moments), (batches, chances))
+        (flat, slow, moments), info = jax.lax.scan(update, (flat, state.slow, state.moments), (batches, noises))
         return SacState(unravel(flat), slow, moments, state.replay, state.spread), info

@@ -93,7 +93,7 @@ def worries(run: OnlineRun) -> list[str]:
         share = float(np.nanmin(at("coverage90")))
         found.append(
             f"The estimator is over-confident{_in(n, several)}: only {share:.0%} of the held-out simulations lie "
-            "inside their 90 % credible set before recalibration, so the ± above may be too small."
+            "inside their 90 % credible set before recalibration, which had to widen it more than fivefold."
         )
     if (n := int(np.nansum(at("overfit")))) > 0:
         found.append(

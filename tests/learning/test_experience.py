@@ -8,6 +8,7 @@ from flax import struct
 
 from bayessim_jax.contracts import Box, Discrete
 from bayessim_jax.learning.collect import Transitions, blank, collect
+from bayessim_jax.learning.heads import Categorical
 from bayessim_jax.learning.ppo import advantages
 from bayessim_jax.learning.replay import Replay
 from bayessim_jax.systems import from_functions
@@ -55,10 +56,12 @@ def counter(broken=1e9):
 
 
 def gather(system, task, steps=30, count=8, episode_steps=1000, blocks=1):
-    choose = lambda observation, uniform: ((uniform > 0.5).astype(float), (uniform > 0.5).astype(float))  # noqa: E731
+    evenly = lambda observations: jnp.zeros((len(observations), 2))  # noqa: E731
 
     def block(worlds, key):
-        worlds, seen, episodes = collect(key, system, task, UnitBelief(), worlds, choose, 1, steps, episode_steps)
+        worlds, seen, episodes = collect(
+            key, system, task, UnitBelief(), worlds, Categorical(2), evenly, steps, episode_steps
+        )
         return worlds, (seen, episodes)
 
     worlds = blank(system, UnitBelief(), count)

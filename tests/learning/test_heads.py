@@ -15,8 +15,8 @@ P = jnp.array([0.3, -0.4, -0.2, 0.1])
 
 
 def samples(head, p, count=40_000):
-    uniform = draw(jax.random.key(0), (count, head.chance))
-    return jax.vmap(head.sample, (None, 0))(p, uniform)
+    noise = head.noise(draw(jax.random.key(0), (count, head.chances)))
+    return jax.vmap(head.sample, (None, 0))(p, noise)
 
 
 def test_uniform_numbers_exclude_both_ends_and_become_standard_normal():

@@ -1,0 +1,67 @@
+"""Many runs of the loop, each with its own seed and its own θ* drawn from the prior: what the tables are made of."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bayessim_jax import online
+from bayessim_jax.engines.simulated import SimulatedTarget
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+
+def trials(setup: online.Setup, runs: int, rounds: int, seed: int = 0, draws: int = 512) -> Iterator[dict[str, Any]]:
+    """Yield, for each run, arrays over rounds: log q(θ*), the credible level and the ranks of θ*, mean log marginals.
+
+    `level` is the smallest highest-density credible level that holds θ*: uniform if calibrated. `rank` is the share of
+    posterior draws below θ*, per axis. `log_marginals` are normal scores of pairs of axes (0, 1), (2, 3), ….
+    """
+    box = setup.system.parameters
+    pairs = [tuple(range(i, min(i + 2, box.size))) for i in range(0, box.size, 2)]
+
+    def one(key: Any) -> dict[str, Any]:
+        truth_key, run_key, judge_key = jax.random.split(key, 3)
+        truth = jax.random.uniform(truth_key, box.low.shape, minval=box.low, maxval=box.high)
+        target = SimulatedTarget(setup.system, setup.task, truth)
+        _, infos = online.run(run_key, setup, target, rounds=rounds)
+
+        def judge(key: Any, belief: Any) -> dict[str, Any]:
+            samples = jax.vmap(belief.sample)(jax.random.split(key, draws))
+            log_truth = belief.log_prob(truth)
+            return {
+                "log_q": log_truth,
+                "level": (jax.vmap(belief.log_prob)(samples) > log_truth).mean(),
+                "rank": (samples < truth).mean(0),
+                "log_marginals": jnp.stack(
+                    [belief.mixture.marginal(pair).log_prob(truth[jnp.array(pair)]) for pair in pairs]
+                ),
+            }
+
+        judged = jax.vmap(judge)(jax.random.split(judge_key, rounds), infos.belief)
+        return judged | {
+            "truth": truth,
+            "return_target": infos.return_target,
+            "coverage90": infos.calibration.coverage90,
+            "diverged": infos.diverged,
+        }
+
+    compiled = jax.jit(one)
+    for index in range(runs):
+        start = time.monotonic()
+        result = jax.block_until_ready(compiled(jax.random.fold_in(jax.random.key(seed), index)))
+        yield jax.tree.map(np.asarray, result) | {"run": index, "seconds": time.monotonic() - start}
+
+
+def save(path: Path, result: dict[str, Any]) -> None:
+    """Append one run as a line of JSON."""
+    plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in result.items()}
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(plain) + "\n")
