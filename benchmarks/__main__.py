@@ -17,6 +17,8 @@ def main() -> None:
     online.add_argument("--repeats", type=int, default=3)
     online.add_argument("--held-out", type=int, default=500)
     online.add_argument("--ladder", type=int, nargs="+", default=[10, 20, 40, 80, 200], help="epochs of our fit to try")
+    online.add_argument("--encoder", default="framed_lstm", help="of our fit to the same held-out log q")
+    online.add_argument("--members", type=int, default=4, help="networks in the ensemble of that fit")
     _add_common(online)
 
     estimator = commands.add_parser("estimator", help="the estimator alone against sbi")

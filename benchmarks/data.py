@@ -51,6 +51,6 @@ def score_held_out(
 
     def one(theta: Float[Array, " d"], recording: Recording) -> Scalar:
         as_set = jax.tree.map(lambda leaf: leaf[None], recording)
-        return estimator.posterior(state, as_set).log_prob(theta)
+        return estimator.posterior(state, as_set, jnp.ones(1, bool)).log_prob(theta)
 
     return jax.vmap(one)(thetas, recordings).mean()

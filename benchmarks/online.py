@@ -62,10 +62,13 @@ def compare_rounds(options: Namespace) -> None:
     system, task = CartPole.create(noise=0.01), Balance(steps=50)
     same = OurRound(
         Ppo.create(system, task, envs=16, horizon=128, epochs=10, minibatches=32, learning_rate=3e-4),
-        recurrent_mixture("lstm", 5, Schedule(epochs=200, patience=200), members=1),
+        recurrent_mixture("lstm", 5, Schedule(epochs=200, patience=200), members=1, folds=10),
     )
     default = default_learner("cartpole", system, Balance())
-    ladder = {n: OurRound(default, recurrent_mixture(schedule=Schedule(epochs=n))) for n in options.ladder}
+    ladder = {
+        n: OurRound(default, recurrent_mixture(options.encoder, 5, Schedule(epochs=n), members=options.members))
+        for n in options.ladder
+    }
     print(f"PyTorch threads: {choose_threads(options.threads)}; {options.repeats} repeats: median (range)", flush=True)
     same.run(options.seed)
     for ours in ladder.values():
@@ -117,7 +120,9 @@ def _print_quality(options: Namespace, curves: Any, best_scores: Any, reached: A
     print(f"| peer, after 200 epochs | {last} | {Spread.of([p.estimator for p in theirs])} |")
     for epochs in options.ladder:
         scores, laps = zip(*(curve[epochs] for curve in curves), strict=True)
-        print(f"| ours, default encoder, {epochs} epochs | {Spread.of(scores)} | {Spread.of(laps)} |")
+        print(
+            f"| ours, {options.encoder} × {options.members}, at most {epochs} epochs | {Spread.of(scores)} | {Spread.of(laps)} |"
+        )
     print()
     found = [(r, b, p) for r, b, p in zip(reached, best_scores, theirs, strict=True) if r is not None]
     print(f"The peer's best log q was reached in {len(found)} of {len(reached)} repeats", end="")

@@ -79,7 +79,16 @@ def stopwatch(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any
     return now() - start, result
 
 
-def measure(function: Callable[..., Any], *arguments: Any, repeats: int = 5) -> Spread:
-    """Seconds of `repeats` calls after one that is not counted, which compiles."""
+def measure(function: Callable[..., Any], *arguments: Any, repeats: int = 5, shortest: float = 0.1) -> Spread:
+    """Seconds of a call, `repeats` times, after one that is not counted; short calls are timed many in a row."""
     jax.block_until_ready(function(*arguments))
-    return Spread.of([stopwatch(function, *arguments)[0] for _ in range(repeats)])
+    once, _ = stopwatch(function, *arguments)
+    calls = max(1, round(shortest / max(once, 1e-6)))
+
+    def lap() -> float:
+        start = now()
+        for _ in range(calls):
+            jax.block_until_ready(function(*arguments))
+        return (now() - start) / calls
+
+    return Spread.of([lap() for _ in range(repeats)])
