@@ -120,9 +120,8 @@ def _print_quality(options: Namespace, curves: Any, best_scores: Any, reached: A
     print(f"| peer, after 200 epochs | {last} | {Spread.of([p.estimator for p in theirs])} |")
     for epochs in options.ladder:
         scores, laps = zip(*(curve[epochs] for curve in curves), strict=True)
-        print(
-            f"| ours, {options.encoder} × {options.members}, at most {epochs} epochs | {Spread.of(scores)} | {Spread.of(laps)} |"
-        )
+        name = f"ours, {options.encoder} × {options.members}, at most {epochs} epochs"
+        print(f"| {name} | {Spread.of(scores)} | {Spread.of(laps)} |")
     print()
     found = [(r, b, p) for r, b, p in zip(reached, best_scores, theirs, strict=True) if r is not None]
     print(f"The peer's best log q was reached in {len(found)} of {len(reached)} repeats", end="")
