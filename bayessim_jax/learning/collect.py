@@ -116,9 +116,9 @@ def collect(
         action = jax.vmap(head.action)(raw)
         state, clean, reward, terminated = jax.vmap(advance)(worlds.theta, worlds.state, action)
         observation = clean + system.noise * look
-        sound = jnp.isfinite(observation).all(-1) & jnp.isfinite(reward) & jnp.isfinite(raw).all(-1)
+        sound = jnp.isfinite(jnp.concatenate([worlds.observation, raw, reward[:, None], observation], -1)).all(-1)
         transition = Transitions(
-            observation=worlds.observation,
+            observation=jnp.where(sound[:, None], worlds.observation, 0.0),
             raw=jnp.where(sound[:, None], raw, 0.0),
             reward=jnp.where(sound, reward, 0.0),
             next_observation=jnp.where(sound[:, None], observation, 0.0),
@@ -129,9 +129,7 @@ def collect(
         after = Worlds(state, worlds.theta, observation, worlds.age + 1, worlds.gained + transition.reward)
         return _where(transition.ended, fresh, after), (transition, after.gained, after.age)
 
-    worlds, (transitions, gained, age) = jax.lax.scan(
-        step, worlds, (uniforms[1:, :, :chance], looks[1:, :, obs:], fresh)
-    )
+    worlds, (transitions, gained, age) = jax.lax.scan(step, worlds, (noise, looks[1:, :, obs:], fresh))
     done = (transitions.ended & transitions.sound).astype(gained.dtype)
     episodes = Episodes(jnp.sum(done * gained), jnp.sum(done * age), jnp.sum(done))
     return worlds, transitions, episodes

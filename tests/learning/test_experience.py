@@ -1,5 +1,7 @@
 """What the learners learn from: collected transitions, their advantages, and the replay buffer."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -102,6 +104,14 @@ def test_an_episode_that_breaks_is_given_up_and_masked():
     np.testing.assert_array_equal(seen.ended, ~seen.sound)
     assert episodes.count == 0
     assert all(np.isfinite(x).all() for x in jax.tree.leaves((worlds, seen)))
+
+
+def test_a_reset_that_is_no_number_is_masked_too():
+    lost = dataclasses.replace(counter(), reset_fn=lambda key, theta: jnp.full(3, jnp.nan))
+    _, seen, episodes = gather(lost, Reaches())
+    assert not seen.sound.any()
+    assert episodes.count == 0
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(seen))
 
 
 def test_actions_and_chance_differ_between_worlds_and_steps():
