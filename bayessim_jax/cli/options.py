@@ -38,7 +38,8 @@ Pairs = Annotated[
         str_from_instance=lambda x: [f"{name}={value}" for name, value in x.items()],
     ),
 ]
-LEAST = {"rounds": 1, "seeds": 1, "steps": 1, "simulations": 10, "recordings": 1, "components": 1, "pool": 1}
+COUNTS = ("rounds", "seeds", "steps", "recordings", "pool", "history", "calibrations", "components")
+LEAST = {**dict.fromkeys(COUNTS, 1), "simulations": 10, "seed": 0, "evaluations": 0, "noise": 0.0}
 
 
 @dataclass(frozen=True)
@@ -67,11 +68,15 @@ class Settings:
     steps: int = 50
     """Steps of a recording, real or simulated."""
     recordings: int = 1
-    """Recordings of the target in a round; together they are one piece of evidence."""
+    """Recordings of the target in a round."""
     evaluations: int = 1
     """Full episodes on the target that judge the policy after each round; 0 for none."""
     pool: int = 10
     """Rounds whose simulations are kept for the fit."""
+    history: int = 32
+    """Recordings of the target that are remembered; the posterior is conditioned on all of them."""
+    calibrations: int = 64
+    """Sets of recordings simulated in a round to calibrate the posterior of the set."""
     components: int = 5
     """Gaussians in the posterior."""
     noise: float = 0.01
@@ -82,7 +87,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Refuse numbers that no run could use."""
-        for name, least in {**LEAST, "seed": 0, "evaluations": 0, "noise": 0.0}.items():
+        for name, least in LEAST.items():
             if getattr(self, name) < least:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be {least} or more.")
         if self.seed + self.seeds > 2**32:

@@ -110,7 +110,7 @@ def _make_plan(settings: Settings) -> Plan:
     box = system.parameters
     pace = dataclasses.asdict(Schedule()) | _checked(dataclasses.asdict(Schedule()), settings.schedule, "schedule")
     learner, habits = _learner(settings.system, system, task, settings.learner)
-    sizes = ("steps", "simulations", "recordings", "evaluations", "pool", "components")
+    sizes = ("steps", "simulations", "recordings", "evaluations", "pool", "history", "calibrations", "components")
     setup = online.Setup.create(
         system,
         learner,

@@ -77,7 +77,7 @@ class Session:
             "inference_library": "bayessim_jax",
             "inference_library_version": __version__,
         }
-        simulations = plan.settings.simulations * plan.settings.recordings
+        simulations = plan.settings.simulations + plan.settings.calibrations * plan.settings.history
         system, settings = plan.setup.system, plan.settings.tables()
         return Journal(self.folder, system, plan.seeds, plan.truths, settings, attributes, simulations)
 

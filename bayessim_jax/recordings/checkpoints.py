@@ -37,17 +37,26 @@ class Checkpoints:
 
     def save(self, rounds: int, state: Any, settings: Mapping[str, Any]) -> None:
         """Write the state; on return it is on disk, whole."""
+        about = {"settings": settings, "shapes": _shapes(state)}
         self.manager.save(
-            rounds, args=ocp.args.Composite(state=ocp.args.StandardSave(state), settings=ocp.args.JsonSave(settings))
+            rounds, args=ocp.args.Composite(state=ocp.args.StandardSave(state), about=ocp.args.JsonSave(about))
         )
         self.manager.wait_until_finished()
 
     def settings(self) -> dict[str, Any]:
         """The settings of the last checkpoint; raises `ValueError` where it is damaged."""
-        return self._restore(settings=ocp.args.JsonRestore())["settings"]
+        return self._restore(about=ocp.args.JsonRestore())["about"]["settings"]
 
     def restore(self, like: Any) -> Any:
         """The last state, in the structure of `like`; raises `ValueError` where it is damaged or of another shape."""
+        stored, wanted = self._restore(about=ocp.args.JsonRestore())["about"]["shapes"], _shapes(like)
+        for name in dict.fromkeys([*stored, *wanted]):
+            there, here = stored.get(name), wanted.get(name)
+            if there != here:
+                raise ValueError(
+                    f"checkpoint {self.path / str(self.latest)} holds another state: {name} is {there} there and {here} "
+                    "here; start again with another --out."
+                )
         abstract = jax.tree.map(ocp.tree.to_shape_dtype_struct, like)
         return self._restore(state=ocp.args.StandardRestore(abstract))["state"]
 
@@ -65,3 +74,9 @@ class Checkpoints:
             f"checkpoint {self.path / str(self.latest)} is damaged ({reason[:160]}); "
             "delete that folder to continue from the one before, or start again with another --out."
         )
+
+
+def _shapes(state: Any) -> dict[str, str]:
+    """Type and shape of every leaf, by its path."""
+    leaves = jax.tree_util.tree_leaves_with_path(state)
+    return {jax.tree_util.keystr(path): f"{leaf.dtype}{list(leaf.shape)}" for path, leaf in leaves}

@@ -60,7 +60,7 @@ def metrics_line(
 
     `log_prob_true` is in raw units of θ; `log_prob_true_scaled` is the density of θ divided by the prior's width,
     log q(θ*) + Σ log(high − low), and `gain_over_prior` is log q(θ*) − log p(θ*): for a uniform prior they are equal.
-    `simulations` counts those of all seeds that shared the `seconds` of the round.
+    `simulations` counts the trajectories of all seeds that shared the `seconds` of the round.
     """
     named = lambda values: dict(zip(parameters.names, np.asarray(values, float).tolist(), strict=True))  # noqa: E731
     width = float(np.log(np.asarray(parameters.width, float)).sum())

@@ -28,6 +28,8 @@ simulations = 20
 steps = 10
 pool = 2
 components = 2
+history = 3
+calibrations = 8
 
 [schedule]
 epochs = 10
@@ -42,21 +44,16 @@ minibatches = 2
 """
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    return tmp_path_factory.mktemp("cache")
-
-
 @pytest.fixture(autouse=True)
-def own_settings(cache, monkeypatch):
-    """The command switches the compilation cache on: put it aside, and JAX's settings back."""
+def own_settings(monkeypatch):
+    """The command switches the compilation cache on: let it be that of the tests, and put JAX's settings back."""
     names = (
         "jax_compilation_cache_dir",
         "jax_persistent_cache_min_compile_time_secs",
         "jax_persistent_cache_min_entry_size_bytes",
     )
     before = {name: getattr(jax.config, name) for name in names}
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(cache))
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", before["jax_compilation_cache_dir"])
     yield
     for name, value in before.items():
         jax.config.update(name, value)

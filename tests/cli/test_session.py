@@ -226,5 +226,6 @@ def test_states_of_another_shape_are_refused(whole, tmp_path):
     shutil.copytree(whole, path)
     plan = MadeUp(rounds=5)
     plan.start = lambda: {"weights": jnp.zeros(7), "round": jnp.array(0)}
-    with pytest.raises(UsageError, match=r"checkpoint .*4 "):
+    with pytest.raises(UsageError) as error:
         sit(path, plan, resume=True)
+    assert "4 holds another state: ['weights'] is float32[4] there and float32[7] here" in str(error.value)

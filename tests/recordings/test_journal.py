@@ -122,7 +122,7 @@ def test_a_checkpoint_knows_its_settings(whole):
 @pytest.mark.parametrize("like", [{"weights": jnp.zeros(4)}, {"weights": jnp.zeros(7), "round": jnp.array(0)}])
 def test_a_state_of_another_shape_is_refused(whole, like):
     checkpoints = Checkpoints(whole.path / "checkpoints")
-    with pytest.raises(ValueError, match=r"checkpoint .*4 "):
+    with pytest.raises(ValueError, match=r"checkpoint .*4 holds another state: \['(weights|round)'\] is"):
         checkpoints.restore(like)
     checkpoints.close()
 
