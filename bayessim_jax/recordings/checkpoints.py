@@ -54,8 +54,8 @@ class Checkpoints:
             there, here = stored.get(name), wanted.get(name)
             if there != here:
                 raise ValueError(
-                    f"checkpoint {self.path / str(self.latest)} holds another state: {name} is {there} there and {here} "
-                    "here; start again with another --out."
+                    f"checkpoint {self.path / str(self.latest)} holds another state: {name} is {there} there and "
+                    f"{here} here; start again with another --out."
                 )
         abstract = jax.tree.map(ocp.tree.to_shape_dtype_struct, like)
         return self._restore(state=ocp.args.StandardRestore(abstract))["state"]
