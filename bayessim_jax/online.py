@@ -21,10 +21,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayessim_jax.beliefs import Truncated
-from bayessim_jax.contracts import Estimator, Learner, Recording, Scalar, System, Target, Task
+from bayessim_jax.contracts import Estimator, Learner, Policy, Recording, Scalar, System, Target, Task
 from bayessim_jax.inference.estimators import recurrent_mixture
 from bayessim_jax.inference.proposals import ProposalMode, lookup_proposal, pool_weights
 from bayessim_jax.rollout import rollout
@@ -106,6 +106,8 @@ class State:
     pool: Pool
     history: Recording
     """What the target has shown, leading axis `setup.history`; the slots not yet filled are empty recordings."""
+    policies: Any
+    """The policy under which each recording of `history` was made."""
 
 
 @struct.dataclass
@@ -139,11 +141,13 @@ def init(key: PRNGKeyArray, setup: Setup) -> State:
     learner = setup.learner.init(learner_key)
     proposal = setup.proposal.propose(belief)
     d = setup.system.parameters.size
-    one = jax.eval_shape(lambda: simulate(key, setup, learner, belief.box.low[None], 1))
+    policy = setup.learner.policy(learner)
+    one = jax.eval_shape(lambda: simulate(key, setup, policy, belief.box.low[None]))
+    remembered = setup.history if setup.proposal.accumulate else setup.recordings
     slots = setup.pool if setup.proposal.reuse else 1
 
     def empty(*axes: int) -> Recording:
-        return jax.tree.map(lambda leaf: jnp.zeros((*axes, *leaf.shape[2:]), leaf.dtype), one)
+        return jax.tree.map(lambda leaf: jnp.zeros((*axes, *leaf.shape[1:]), leaf.dtype), one)
 
     return State(
         round=jnp.array(0),
@@ -156,20 +160,26 @@ def init(key: PRNGKeyArray, setup: Setup) -> State:
             proposals=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (slots, *jnp.shape(leaf))), proposal),
             filled=jnp.zeros(slots),
         ),
-        history=empty(setup.history if setup.proposal.accumulate else setup.recordings),
+        history=empty(remembered),
+        policies=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (remembered, *jnp.shape(leaf))), policy),
     )
 
 
-def simulate(key: PRNGKeyArray, setup: Setup, learner: Any, thetas: Float[Array, "n d"], each: int) -> Recording:
-    """`each` recordings for every θ under the current stochastic policy; leading axes (n, each)."""
-    policy = setup.learner.policy(learner)
+def simulate(key: PRNGKeyArray, setup: Setup, policy: Policy, thetas: Float[Array, "n d"]) -> Recording:
+    """One recording for every θ under one policy; leading axis n."""
+    keys = jax.random.split(key, thetas.shape[0])
+    return jax.vmap(lambda k, theta: rollout(k, setup.system, theta, policy, setup.steps, setup.task))(keys, thetas)
 
-    def one(key: PRNGKeyArray, theta: Float[Array, " d"]) -> Recording:
+
+def simulate_mixed(key: PRNGKeyArray, setup: Setup, policies: Any, slots: Array, thetas: Array) -> Recording:
+    """One recording for every θ, each under the policy of its slot; leading axis n."""
+    keys = jax.random.split(key, thetas.shape[0])
+    chosen = jax.tree.map(lambda leaf: leaf[slots], policies)
+
+    def one(key: PRNGKeyArray, policy: Policy, theta: Float[Array, " d"]) -> Recording:
         return rollout(key, setup.system, theta, policy, setup.steps, setup.task)
 
-    keys = jax.random.split(key, thetas.shape[0] * each)
-    flat = jax.vmap(one)(keys, jnp.repeat(thetas, each, axis=0))
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, each, *leaf.shape[1:]), flat)
+    return jax.vmap(one)(keys, chosen, thetas)
 
 
 def record(key: PRNGKeyArray, setup: Setup, target: Target, state: State) -> Recording:
@@ -198,19 +208,25 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
     draw_key, simulate_key, fit_key, calibrate_key, learn_key = jax.random.split(
         jax.random.fold_in(key, state.round), 5
     )
-    # simulate around the belief: some to fit the estimator, some to calibrate what it says of sets
+    policy = setup.learner.policy(state.learner)
+    history, policies, use, newest = _remember(state, recordings, policy)
+
+    # simulate around the belief, every other draw under an earlier policy whose recordings still count
     proposal = setup.proposal.propose(state.belief)
     fresh = setup.simulations
     thetas = jax.vmap(proposal.sample)(jax.random.split(draw_key, fresh + setup.calibrations))
-    simulated = simulate(simulate_key, setup, state.learner, thetas[:fresh], 1)
-    pool = _insert(state.pool, state.round, thetas[:fresh], simulated, proposal)
+    slot_key, simulate_key = jax.random.split(simulate_key)
+    earlier = jax.random.categorical(slot_key, jnp.where(use, 0.0, -jnp.inf), shape=(fresh,))
+    slots = jnp.where(jnp.arange(fresh) % 2 == 0, newest, jnp.where(use.any(), earlier, newest))
+    simulated = simulate_mixed(simulate_key, setup, policies, slots, thetas[:fresh])
+    pool = _insert(state.pool, state.round, thetas[:fresh], jax.tree.map(lambda x: x[:, None], simulated), proposal)
     weights = pool_weights(pool.thetas, pool.proposals, pool.filled, proposal).ravel()
-    points, singles = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (pool.thetas, pool.recordings))
+    points, singles = jax.tree.map(_rows, (pool.thetas, pool.recordings))
     estimator, fit = setup.estimator.fit(fit_key, state.estimator, points, singles, weights)
 
-    # the posterior of everything the target has shown
-    history, use = _remember(state.history, state.round, recordings)
-    sets = simulate(jax.random.fold_in(calibrate_key, 0), setup, state.learner, thetas[fresh:], use.size)
+    # the posterior of everything the target has shown, calibrated on sets made under the same policies
+    set_keys = jax.random.split(jax.random.fold_in(calibrate_key, 0), use.size)
+    sets = jax.vmap(lambda k, p: simulate(k, setup, p, thetas[fresh:]), out_axes=1)(set_keys, policies)
     calibrated, calibration = setup.estimator.calibrate(calibrate_key, estimator, thetas[fresh:], sets, use)
     estimator = calibrated if setup.proposal.accumulate else estimator
     q = setup.estimator.posterior(estimator, history, use)
@@ -231,7 +247,7 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
         pool_size=weights.sum() ** 2 / (weights**2).sum(),
         collapsed=(shrinkage < -jnp.log(1e3)) & calibration.overconfident,
     )
-    return State(state.round + 1, belief, estimator, learner, pool, history), info
+    return State(state.round + 1, belief, estimator, learner, pool, history, policies), info
 
 
 def run(
@@ -256,12 +272,19 @@ def _insert(pool: Pool, round_: Array, thetas: Array, recordings: Recording, pro
     )
 
 
-def _remember(history: Recording, round_: Array, recordings: Recording) -> tuple[Recording, Bool[Array, " history"]]:
-    """Overwrite the oldest recordings; which slots hold one that is sound."""
-    size, new = history.diverged.size, recordings.diverged.size
-    rows = (round_ * new + jnp.arange(new)) % size
-    history = jax.tree.map(lambda leaf, part: leaf.at[rows].set(part), history, recordings)
-    return history, (jnp.arange(size) < (round_ + 1) * new) & ~history.diverged
+def _remember(state: State, recordings: Recording, policy: Policy) -> tuple[Recording, Any, Array, Array]:
+    """Overwrite the oldest recordings and their policies; which slots hold a sound one; the slot of the newest."""
+    size, new = state.history.diverged.size, recordings.diverged.size
+    rows = (state.round * new + jnp.arange(new)) % size
+    history = jax.tree.map(lambda leaf, part: leaf.at[rows].set(part), state.history, recordings)
+    policies = jax.tree.map(lambda leaf, part: leaf.at[rows].set(part), state.policies, policy)
+    use = (jnp.arange(size) < (state.round + 1) * new) & ~history.diverged
+    return history, policies, use, rows[-1]
+
+
+def _rows(leaf: Array) -> Array:
+    """Join the first two axes, also where another one is empty (a machine without actuators)."""
+    return leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:])
 
 
 def _log_volume(belief: Truncated) -> Scalar:

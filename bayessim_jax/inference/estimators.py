@@ -151,7 +151,10 @@ class MixtureDensity:
         """Measure the posterior of sets on sets that no network has seen, and take out what is wrong with it."""
         z = (thetas - state.shift) / state.scale
         x, valid = self._inputs(state, recordings)
-        plain = jax.lax.map(lambda one: self._combined(state.params, one[0], one[1], use), (x, valid & use[:, None]))
+        sound = use & ~recordings.diverged
+        plain = jax.lax.map(
+            lambda one: self._combined(state.params, one[0], one[1] & one[2][:, None], one[2]), (x, valid, sound)
+        )
         recalibration = recalibrate(plain, z)
         coverage = (credible_level(key, plain, z) <= 0.9).mean()
         widen = jnp.exp(jnp.log(jnp.diagonal(recalibration.stretch)).mean())
@@ -191,7 +194,7 @@ class MixtureDensity:
             return alone
         count = alone.log_weights.size
         together = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), combine_evidence(each, use))
-        return jax.tree.map(lambda a, b: jnp.where(use.sum() > 1, a, b), together, alone)
+        return jax.tree.map(lambda a, b: jnp.where(use.sum() == 1, b, a), together, alone)
 
     def _set_units(self, state: EstimatorState, thetas: Array, recordings: Recording, weights: Array) -> EstimatorState:
         x = jax.vmap(jax.vmap(transition_features))(recordings)
