@@ -205,6 +205,9 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
             f"update: recordings have shape {recordings.valid.shape} (set, steps); this setup was made for "
             f"({setup.recordings}, {setup.steps}): pad the recordings or change `recordings` and `steps`."
         )
+    # barriers: what the compiler makes of a round does not depend on what stands around it, so that a round in a scan
+    # and one called by itself are the same to the last bit
+    state, recordings = jax.lax.optimization_barrier((state, recordings))
     draw_key, simulate_key, fit_key, calibrate_key, learn_key = jax.random.split(
         jax.random.fold_in(key, state.round), 5
     )
@@ -247,7 +250,8 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
         pool_size=weights.sum() ** 2 / (weights**2).sum(),
         collapsed=(shrinkage < -jnp.log(1e3)) & calibration.overconfident,
     )
-    return State(state.round + 1, belief, estimator, learner, pool, history, policies), info
+    after = State(state.round + 1, belief, estimator, learner, pool, history, policies)
+    return jax.lax.optimization_barrier((after, info))
 
 
 def run(
