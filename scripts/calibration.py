@@ -54,7 +54,8 @@ def main() -> None:
     print()
     log_q, level, rank = (np.stack([r[name] for r in results]) for name in ("log_q", "level", "rank"))
     for t in range(args.rounds):
-        _, p = uniformity_test(jax.numpy.asarray(rank[:, t] * 512), 512)
+        bins = min(10, len(results) // 5)
+        p = uniformity_test(jax.numpy.asarray(rank[:, t] * 512), 512, bins)[1] if bins > 1 else np.nan
         spread = log_q[:, t].std(ddof=1) / np.sqrt(len(results)) if len(results) > 1 else float("nan")
         print(
             f"round {t + 1:2d}: log q(θ*) {log_q[:, t].mean():6.2f} ± {spread:.2f}, "
