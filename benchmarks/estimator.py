@@ -43,7 +43,9 @@ def compare_estimators(options: Namespace) -> None:
         inputs, targets = stack_rows(recordings), np.asarray(thetas)
         for name in options.encoders:
             schedule = Schedule(epochs=options.epochs, draws=n)
-            rows.setdefault(f"ours, {name}", []).append(fit_ours(seed, name, schedule, thetas, recordings, n))
+            rows.setdefault(f"ours, {name}", []).append(
+                fit_ours(seed, name, options.members, schedule, thetas, recordings, n)
+            )
         for model in options.models:
             peer = fit_npe(model, targets[:n], inputs[:n], targets[n:], inputs[n:], seed)
             rows.setdefault(f"sbi, {model}", []).append((peer.log_q, peer.seconds, peer.seconds))
@@ -63,10 +65,10 @@ def compare_estimators(options: Namespace) -> None:
 
 
 def fit_ours(
-    seed: int, encoder: str, schedule: Schedule, thetas: Any, recordings: Recording, n: int
+    seed: int, encoder: str, members: int, schedule: Schedule, thetas: Any, recordings: Recording, n: int
 ) -> tuple[float, float, float]:
     """Held-out log q, seconds of a compiled fit, and seconds with compilation; pairs from n on are held out."""
-    estimator = recurrent_mixture(encoder, 5, schedule)
+    estimator = recurrent_mixture(encoder, 5, schedule, members=members)
     example = jax.tree.map(lambda leaf: leaf[:1], recordings)
     as_sets = jax.tree.map(lambda leaf: leaf[:n, None], recordings)
     state = estimator.init(jax.random.key(seed), example, thetas.shape[1])
