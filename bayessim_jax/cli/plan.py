@@ -50,7 +50,7 @@ class Plan:
         first = jax.jit(lambda setup, key: online.init(jax.random.split(key, 4)[0], setup))
         # one after the other: XLA's batched QR, of orthogonal initial weights, can deadlock on a CPU with few cores
         states = [first(self.setup, key) for key in self.keys]
-        return jax.tree.map(lambda *leaves: jax.numpy.stack(leaves), *states)
+        return jax.tree.map(lambda *leaves: jax.numpy.stack(leaves).astype(leaves[0].dtype), *states)
 
     def compile(self, states: online.State) -> Callable[[online.State], tuple[online.State, online.RoundInfo]]:
         """One round of all seeds as compiled functions of their states, the same round that `online.run` does.

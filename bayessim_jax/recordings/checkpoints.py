@@ -8,6 +8,7 @@ import warnings
 from typing import TYPE_CHECKING, Any
 
 import jax
+import jax.numpy as jnp
 import orbax.checkpoint as ocp
 
 if TYPE_CHECKING:
@@ -58,7 +59,9 @@ class Checkpoints:
                     f"{here} here; start again with another --out."
                 )
         abstract = jax.tree.map(ocp.tree.to_shape_dtype_struct, like)
-        return self._restore(state=ocp.args.StandardRestore(abstract))["state"]
+        restored = self._restore(state=ocp.args.StandardRestore(abstract))["state"]
+        # tied to no device, as the arrays of a new run are: the same programs then serve both from the cache
+        return jax.tree.map(jnp.asarray, jax.device_get(restored))
 
     def _restore(self, **items: Any) -> Any:
         if self.latest is None:
