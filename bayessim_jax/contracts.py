@@ -204,8 +204,12 @@ class Estimator(Protocol[E]):
         thetas: Float[Array, "n d"],
         recordings: Recording,
         use: Bool[Array, " set"],
+        correct: bool = True,
     ) -> tuple[E, Any]:
-        """Correct the posterior of sets on sets that were never trained on (leading axes of recordings: n, set)."""
+        """Correct the posterior of sets on sets that were never trained on (leading axes of recordings: n, set).
+
+        Without `correct` the posterior is only judged. Info holds `coverage50`, `coverage90` and `overconfident`.
+        """
         ...
 
     def posterior(self, state: E, recordings: Recording, use: Bool[Array, " set"]) -> Any:

@@ -16,7 +16,7 @@ Source: Possas et al. 2020, Algorithm 1
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,20 @@ from bayessim_jax.inference.estimators import recurrent_mixture
 from bayessim_jax.inference.proposals import ProposalMode, lookup_proposal, pool_weights
 from bayessim_jax.rollout import rollout
 
-__all__ = ["Pool", "RoundInfo", "Setup", "State", "init", "record", "run", "simulate", "update"]
+__all__ = [
+    "Keys",
+    "Pool",
+    "RoundInfo",
+    "Setup",
+    "State",
+    "evaluate",
+    "init",
+    "record",
+    "run",
+    "simulate",
+    "split",
+    "update",
+]
 
 
 @struct.dataclass
@@ -53,7 +66,7 @@ class Setup:
     """Rounds whose simulations are kept for the fit."""
     history: int = struct.field(pytree_node=False, default=32)
     """Recordings of the target that are remembered, the newest; the posterior is conditioned on all of them."""
-    calibrations: int = struct.field(pytree_node=False, default=64)
+    calibrations: int = struct.field(pytree_node=False, default=128)
     """Draws of θ for which as many recordings are simulated as the target has given, to calibrate their posterior."""
     components: int = struct.field(pytree_node=False, default=5)
     """Gaussians in the belief."""
@@ -121,7 +134,7 @@ class RoundInfo:
     fit: Any
     """The estimator's Info of the fit: `log_q_train`, `log_q_validation`, `best_epoch`, `overfit`, `nonfinite`."""
     calibration: Any
-    """The estimator's Info of the calibration: `coverage90`, `widen`, `overconfident`."""
+    """The estimator's Info of the calibration: `coverage50`, `coverage90`, `widen`, `overconfident`, ...."""
     learning: Any
     """The learner's Info: at least `return_mean` and `nonfinite`."""
     return_target: Scalar
@@ -132,6 +145,20 @@ class RoundInfo:
     """Effective number of simulations that the fit stood on, (Σ w)² / Σ w²."""
     collapsed: Any
     """The belief fell to less than a thousandth of its volume in one round while the estimator was over-confident."""
+
+
+class Keys(NamedTuple):
+    """The keys that a run passes to `init`, `record`, `update` and `evaluate`, the same ones in every round."""
+
+    init: PRNGKeyArray
+    record: PRNGKeyArray
+    update: PRNGKeyArray
+    evaluate: PRNGKeyArray
+
+
+def split(key: PRNGKeyArray) -> Keys:
+    """What `run` makes of its key: with these, a loop over `record`, `update` and `evaluate` is the same run."""
+    return Keys(*jax.random.split(key, 4))
 
 
 def init(key: PRNGKeyArray, setup: Setup) -> State:
@@ -230,8 +257,9 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
     # the posterior of everything the target has shown, calibrated on sets made under the same policies
     set_keys = jax.random.split(jax.random.fold_in(calibrate_key, 0), use.size)
     sets = jax.vmap(lambda k, p: simulate(k, setup, p, thetas[fresh:]), out_axes=1)(set_keys, policies)
-    calibrated, calibration = setup.estimator.calibrate(calibrate_key, estimator, thetas[fresh:], sets, use)
-    estimator = calibrated if setup.proposal.accumulate else estimator
+    estimator, calibration = setup.estimator.calibrate(
+        calibrate_key, estimator, thetas[fresh:], sets, use, correct=setup.proposal.accumulate
+    )
     q = setup.estimator.posterior(estimator, history, use)
     posterior = setup.proposal.combine(state.belief, proposal, q)
     unusable = recordings.diverged.all()
@@ -258,14 +286,14 @@ def run(
     key: PRNGKeyArray, setup: Setup, target: Target, state: State | None = None, *, rounds: int = 30
 ) -> tuple[State, RoundInfo]:
     """`rounds` rounds as one scan; the Info of every round is stacked. Continue by passing the state returned."""
-    init_key, target_key, update_key, evaluate_key = jax.random.split(key, 4)
+    keys = split(key)
 
     def one_round(state: State, _: None) -> tuple[State, RoundInfo]:
-        recordings = record(target_key, setup, target, state)
-        state, info = update(update_key, setup, state, recordings)
-        return state, replace(info, return_target=evaluate(evaluate_key, setup, target, state))
+        recordings = record(keys.record, setup, target, state)
+        state, info = update(keys.update, setup, state, recordings)
+        return state, replace(info, return_target=evaluate(keys.evaluate, setup, target, state))
 
-    return jax.lax.scan(one_round, init(init_key, setup) if state is None else state, None, length=rounds)
+    return jax.lax.scan(one_round, init(keys.init, setup) if state is None else state, None, length=rounds)
 
 
 def _insert(pool: Pool, round_: Array, thetas: Array, recordings: Recording, proposal: Any) -> Pool:

@@ -48,8 +48,8 @@ def _same(a, b):
 def test_chunks_and_a_python_loop_are_the_whole_run_bit_for_bit(cartpole, run):
     setup, target = cartpole
     key = jax.random.key(3)
-    init_key, target_key, update_key, _ = jax.random.split(key, 4)
-    start = jax.jit(online.init)(init_key, setup)
+    keys = online.split(key)
+    start = jax.jit(online.init)(keys.init, setup)
     whole, infos = run(key, setup, target, start, rounds=4)
     assert int(whole.round) == 4
 
@@ -62,7 +62,7 @@ def test_chunks_and_a_python_loop_are_the_whole_run_bit_for_bit(cartpole, run):
 
     state, record, update = start, jax.jit(online.record), jax.jit(online.update)
     for _ in range(4):
-        state, _ = update(update_key, setup, state, record(target_key, setup, target, state))
+        state, _ = update(keys.update, setup, state, record(keys.record, setup, target, state))
     assert _same(whole, state)
 
 

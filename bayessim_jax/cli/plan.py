@@ -47,10 +47,11 @@ class Plan:
 
     def start(self) -> online.State:
         """The state of every seed before the first round, with a leading axis over the seeds."""
-        first = jax.jit(lambda setup, key: online.init(jax.random.split(key, 4)[0], setup))
-        # one after the other: XLA's batched QR, of orthogonal initial weights, can deadlock on a CPU with few cores
-        states = [first(self.setup, key) for key in self.keys]
-        return jax.tree.map(lambda *leaves: jax.numpy.stack(leaves).astype(leaves[0].dtype), *states)
+        one = lambda setup, key: online.init(online.split(key).init, setup)  # noqa: E731
+        states = jax.jit(jax.vmap(one, (None, 0)))(self.setup, self.keys)
+        return jax.tree.map(
+            lambda leaf: leaf.astype(leaf.dtype), states
+        )  # no weak types: what is compiled fits a checkpoint
 
     def compile(self, states: online.State) -> Callable[[online.State], tuple[online.State, online.RoundInfo]]:
         """One round of all seeds as compiled functions of their states, the same round that `online.run` does.
@@ -58,33 +59,32 @@ class Plan:
         What calls the target on the host is apart from what only computes, because programs with callbacks are not
         kept by the persistent compilation cache.
         """
-        setup, keys, thetas = self.setup, self.keys, jax.numpy.asarray(self.truths)
-        aim = lambda theta: self.target.replace(theta=theta)  # noqa: E731
-        part = lambda key, i: jax.random.split(key, 4)[i]  # noqa: E731
+        setup, thetas = self.setup, jax.numpy.asarray(self.truths)
+        keys = jax.vmap(online.split)(self.keys)
 
         def record(setup: online.Setup, keys: Any, thetas: Any, states: Any) -> Any:
-            one = lambda k, theta, state: online.record(part(k, 1), setup, aim(theta), state)  # noqa: E731
+            one = lambda k, theta, state: online.record(k, setup, self.target.replace(theta=theta), state)  # noqa: E731
             return _over_seeds(one, len(self.seeds))(keys, thetas, states)
 
         def update(setup: online.Setup, keys: Any, states: Any, recordings: Any) -> Any:
-            one = lambda k, state, seen: online.update(part(k, 2), setup, state, seen)  # noqa: E731
+            one = lambda k, state, seen: online.update(k, setup, state, seen)  # noqa: E731
             return _over_seeds(one, len(self.seeds))(keys, states, recordings)
 
         def evaluate(setup: online.Setup, keys: Any, thetas: Any, states: Any) -> Any:
-            one = lambda k, theta, state: online.evaluate(part(k, 3), setup, aim(theta), state)  # noqa: E731
+            one = lambda k, theta, state: online.evaluate(k, setup, self.target.replace(theta=theta), state)  # noqa: E731
             return _over_seeds(one, len(self.seeds))(keys, thetas, states)
 
-        seen = jax.eval_shape(record, setup, keys, thetas, states)
+        seen = jax.eval_shape(record, setup, keys.record, thetas, states)
         with ThreadPoolExecutor() as pool:  # the two are compiled while the third is traced
-            recorder = pool.submit(jax.jit(record).lower(setup, keys, thetas, states).compile)
-            evaluator = pool.submit(jax.jit(evaluate).lower(setup, keys, thetas, states).compile)
-            updater = jax.jit(update).lower(setup, keys, states, seen).compile()
+            recorder = pool.submit(jax.jit(record).lower(setup, keys.record, thetas, states).compile)
+            evaluator = pool.submit(jax.jit(evaluate).lower(setup, keys.evaluate, thetas, states).compile)
+            updater = jax.jit(update).lower(setup, keys.update, states, seen).compile()
         recorder, evaluator = recorder.result(), evaluator.result()
 
         def advance(states: online.State) -> tuple[online.State, online.RoundInfo]:
-            recordings = recorder(setup, keys, thetas, states)
-            states, infos = updater(setup, keys, states, recordings)
-            return states, infos.replace(return_target=evaluator(setup, keys, thetas, states))
+            recordings = recorder(setup, keys.record, thetas, states)
+            states, infos = updater(setup, keys.update, states, recordings)
+            return states, infos.replace(return_target=evaluator(setup, keys.evaluate, thetas, states))
 
         return advance
 

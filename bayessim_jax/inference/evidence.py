@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -41,16 +43,25 @@ def combine_evidence(each: GaussianMixture, use: Bool[Array, " set"]) -> Gaussia
 
 @struct.dataclass
 class Recalibration:
-    """A correction of a posterior in the coordinates that its own moments whiten: a shift and a stretch."""
+    """A correction of a posterior in the coordinates that its own moments whiten: a shift and a stretch.
 
-    shift: Float[Array, " d"]
+    The shift is linear in where the posterior sits, shift = (1, x) · slopes with x = (mean − origin)/unit, |x| ≤ 3.
+    """
+
+    origin: Float[Array, " d"]
+    unit: Float[Array, " d"]
+    slopes: Float[Array, "1+d d"]
     stretch: Float[Array, "d d"]
     """Lower triangular."""
 
     @classmethod
     def none(cls, d: int) -> Recalibration:
         """The identity."""
-        return cls(jnp.zeros(d), jnp.eye(d))
+        return cls(jnp.zeros(d), jnp.ones(d), jnp.zeros((1 + d, d)), jnp.eye(d))
+
+    def shift(self, mean: Float[Array, " d"]) -> Float[Array, " d"]:
+        """By how many of its own standard deviations a posterior with this mean is off."""
+        return self._features(mean) @ self.slopes
 
     def apply(self, mixture: GaussianMixture) -> GaussianMixture:
         """θ ↦ μ + L (shift + stretch L⁻¹ (θ − μ)), with μ and L Lᵀ the mean and covariance of the mixture."""
@@ -59,44 +70,65 @@ class Recalibration:
         linear = tril @ self.stretch @ inverse
         return GaussianMixture(
             mixture.log_weights,
-            mean + tril @ self.shift + (mixture.means - mean) @ linear.T,
+            mean + tril @ self.shift(mean) + (mixture.means - mean) @ linear.T,
             linear @ mixture.scale_trils,
         )
 
+    def _features(self, mean: Float[Array, " d"]) -> Float[Array, " 1+d"]:
+        return jnp.concatenate([jnp.ones(1), jnp.clip((mean - self.origin) / self.unit, -3.0, 3.0)])
 
-def recalibrate(mixtures: GaussianMixture, truths: Float[Array, "n d"]) -> Recalibration:
-    """The correction that makes held-out truths look like draws of their posteriors.
 
-    r = L⁻¹ (θ − μ) of a calibrated posterior has mean zero and covariance I, and ‖r‖² has the quantiles of χ²(d). The
-    shift is the median of r; the stretch has the shape of the covariance of r, shrunk towards isotropy, and the size at
-    which the quantiles at 50 % and 90 % agree (geometric mean of their ratios). Both are shrunk towards no correction
-    by a few pseudo-observations, the stretch covers the error of the shift, and it never narrows:
-    a mixture with a sharp core and wide tails has small quantiles without being too wide.
+def recalibrate(
+    mixtures: GaussianMixture, truths: Float[Array, "n d"], weights: Float[Array, " n"], pseudo: float = 3.0
+) -> Recalibration:
+    """The correction that makes held-out truths look like draws of their posteriors; a weight of 0 leaves a pair out.
+
+    r = L⁻¹ (θ − μ) of a calibrated posterior has mean zero and covariance I wherever μ is, and ‖r‖² has the quantiles
+    of χ²(d). The shift is the regression of r on μ, with bounded residuals and shrunk by `pseudo` observations: it
+    takes out what the networks get wrong as a function of θ. The stretch has the shape of the covariance of what is
+    left, shrunk towards isotropy, and the size at which the quantiles at 50 % and 90 % agree (geometric mean of their
+    ratios) with the error of the regression added. It never narrows: a mixture with a sharp core and wide tails has
+    small quantiles without being too wide.
+
+    Source: Blum and François 2010
     """
 
-    def whiten(mixture: GaussianMixture, truth: Array) -> Array:
+    def whiten(mixture: GaussianMixture, truth: Array) -> tuple[Array, Array]:
         mean, tril = moment_match(mixture)
-        return jax.scipy.linalg.solve_triangular(tril, truth - mean, lower=True)
+        return mean, jax.scipy.linalg.solve_triangular(tril, truth - mean, lower=True)
 
-    n, d = truths.shape
-    r = jnp.clip(jax.vmap(whiten)(mixtures, truths), -50.0, 50.0)
-    shift = n / (n + 10.0) * jnp.median(r, axis=0)
-    centred = r - shift
-    bounded = (
-        centred * jnp.minimum(1.0, 3.0 * jnp.sqrt(d) / jnp.maximum(jnp.linalg.norm(centred, axis=-1), 1e-6))[:, None]
-    )
-    covariance = bounded.T @ bounded / n
-    size = jnp.trace(covariance) / d
-    shape = (n * covariance + 10.0 * size * jnp.eye(d)) / (n + 10.0)
-    tril = jnp.linalg.cholesky(shape + 1e-6 * jnp.eye(d))
-    tril = tril / jnp.exp(jnp.log(jnp.diagonal(tril)).mean())
-    squared = (jax.scipy.linalg.solve_triangular(tril, centred.T, lower=True) ** 2).sum(0)
-    levels = jnp.array([0.5, 0.9])
-    log_ratio = 0.5 * (jnp.log(jnp.quantile(squared, levels)) - jnp.log(_chi2_quantile(levels, d))).mean()
-    factor = jnp.exp(n / (n + 10.0) * jnp.maximum(log_ratio, 0.0)) * jnp.sqrt(1.0 + 1.0 / n)
-    sound = jnp.isfinite(factor) & jnp.isfinite(shift).all() & jnp.isfinite(tril).all()
+    d, n = truths.shape[1], weights.sum()
+    means, r = jax.vmap(whiten)(mixtures, truths)
+    r = jnp.clip(r, -50.0, 50.0)
+    share = weights[:, None] / n
+    origin = (share * means).sum(0)
+    unit = jnp.sqrt((share * (means - origin) ** 2).sum(0)) + 1e-6
     plain = Recalibration.none(d)
-    return jax.tree.map(lambda a, b: jnp.where(sound, a, b), Recalibration(shift, factor * tril), plain)
+    where = replace(plain, origin=origin, unit=unit)
+    x = jax.vmap(where._features)(means)
+
+    def regress(w: Array) -> tuple[Array, Array, Array]:
+        gram = (x * w[:, None]).T @ x
+        ridge = gram + pseudo * jnp.eye(1 + d)
+        slopes = jnp.linalg.solve(ridge, (x * w[:, None]).T @ r)
+        return slopes, r - x @ slopes, jnp.trace(jnp.linalg.solve(ridge, gram))
+
+    _, left, _ = regress(weights)
+    spread = jnp.sqrt((share * left**2).sum(0))
+    bound = jnp.minimum(1.0, 3.0 * jnp.sqrt(d) / jnp.maximum(jnp.linalg.norm(left / spread, axis=-1), 1e-6))
+    slopes, left, freedom = regress(weights * bound)
+    covariance = (left * (weights * bound)[:, None]).T @ left / n
+    shape = (n * covariance + 10.0 * jnp.trace(covariance) / d * jnp.eye(d)) / (n + 10.0)
+    tril = jnp.linalg.cholesky(shape + 1e-6 * jnp.eye(d))
+    squared = (jax.scipy.linalg.solve_triangular(tril, left.T, lower=True) ** 2).sum(0)
+    levels = jnp.array([0.5, 0.9])
+    quantiles = jnp.nanquantile(jnp.where(weights > 0, squared, jnp.nan), levels)
+    factor = jnp.exp(0.5 * (jnp.log(quantiles) - jnp.log(_chi2_quantile(levels, d))).mean())
+    stretch = factor * jnp.sqrt((n + freedom) / (n - freedom)) * tril
+    stretch = stretch / jnp.minimum(1.0, jnp.exp(jnp.log(jnp.diagonal(stretch)).mean()))
+    found = replace(where, slopes=slopes, stretch=stretch)
+    sound = jnp.isfinite(slopes).all() & jnp.isfinite(stretch).all()
+    return jax.tree.map(lambda a, b: jnp.where(sound, a, b), found, plain)
 
 
 def _chi2_quantile(levels: Float[Array, " n"], d: int) -> Float[Array, " n"]:

@@ -92,8 +92,8 @@ def worries(run: OnlineRun) -> list[str]:
     if (n := int(np.nansum(at("overconfident")))) > 0:
         share = float(np.nanmin(at("coverage90")))
         found.append(
-            f"The estimator is over-confident{_in(n, several)}: only {share:.0%} of the held-out simulations lie "
-            "inside their 90 % credible set before recalibration, which had to widen it more than fivefold."
+            f"The posterior is over-confident{_in(n, several)}: only {share:.0%} of the held-out simulated sets lie "
+            "inside their 90 % credible set, recalibration included."
         )
     if (n := int(np.nansum(at("overfit")))) > 0:
         found.append(

@@ -41,8 +41,8 @@ def test_recalibration_undoes_a_known_bias_and_overconfidence():
     stated = GaussianMixture(
         jnp.zeros((n, 1)), (means + tril @ jnp.array([0.4, -0.2]))[:, None], jnp.broadcast_to(tril / 2, (n, 1, d, d))
     )
-    found = recalibrate(stated, truths)
-    assert jnp.allclose(found.shift, -2 * jnp.array([0.4, -0.2]), atol=0.1)
+    found = recalibrate(stated, truths, jnp.ones(n))
+    assert jnp.allclose(found.shift(jnp.zeros(d)), -2 * jnp.array([0.4, -0.2]), atol=0.1)
     assert jnp.allclose(jnp.diagonal(found.stretch), 2.0, atol=0.15)
     corrected = jax.vmap(found.apply)(stated)
     level = credible_level(jax.random.key(2), corrected, truths)
@@ -54,5 +54,30 @@ def test_recalibration_leaves_a_calibrated_posterior_alone():
     means = jax.random.normal(jax.random.key(3), (n, 3))
     truths = means + jax.random.normal(jax.random.key(4), (n, 3))
     stated = GaussianMixture(jnp.zeros((n, 1)), means[:, None], jnp.broadcast_to(jnp.eye(3), (n, 1, 3, 3)))
-    found = recalibrate(stated, truths)
-    assert jnp.abs(found.shift).max() < 0.08 and jnp.allclose(found.stretch, jnp.eye(3), atol=0.1)
+    found = recalibrate(stated, truths, jnp.ones(n))
+    assert jnp.abs(jax.vmap(found.shift)(means)).max() < 0.3 and jnp.allclose(found.stretch, jnp.eye(3), atol=0.1)
+
+
+def test_recalibration_takes_out_an_error_that_depends_on_where_the_posterior_sits():
+    n = 1000
+    keys = jax.random.split(jax.random.key(5), 2)
+    truths = jax.random.normal(keys[0], (n, 2))
+    # a network that shrinks towards zero and knows nothing of it
+    means = 0.5 * truths + 0.05 * jax.random.normal(keys[1], (n, 2))
+    stated = GaussianMixture(jnp.zeros((n, 1)), means[:, None], jnp.broadcast_to(0.05 * jnp.eye(2), (n, 1, 2, 2)))
+    corrected = jax.vmap(recalibrate(stated, truths, jnp.ones(n)).apply)(stated)
+    assert jnp.abs(corrected.means[:, 0] - truths).mean() < 0.1
+    assert jnp.allclose(jnp.sqrt(jax.tree.map(lambda leaf: leaf[0], corrected).covariance().diagonal()), 0.1, atol=0.01)
+    assert abs(float((credible_level(jax.random.key(6), corrected, truths) <= 0.9).mean()) - 0.9) < 0.03
+
+
+def test_a_pair_of_weight_zero_does_not_count():
+    means = jax.random.normal(jax.random.key(7), (40, 2))
+    truths = means + jax.random.normal(jax.random.key(8), (40, 2))
+    stated = GaussianMixture(jnp.zeros((40, 1)), means[:, None], jnp.broadcast_to(jnp.eye(2), (40, 1, 2, 2)))
+    first = jax.tree.map(lambda leaf: leaf[:25], stated)
+    some = recalibrate(stated, truths.at[25:].set(9.0), (jnp.arange(40) < 25).astype(float))
+    fewer = recalibrate(first, truths[:25], jnp.ones(25))
+    assert all(
+        jnp.allclose(a, b, atol=1e-4) for a, b in zip(jax.tree.leaves(some), jax.tree.leaves(fewer), strict=True)
+    )

@@ -21,7 +21,9 @@ class Fit:
 
 @struct.dataclass
 class Calibration:
+    coverage50: jax.Array
     coverage90: jax.Array
+    coverage90_network: jax.Array
     widen: jax.Array
     overconfident: jax.Array
 
@@ -63,7 +65,13 @@ def one_info(system, index, truth, steps=5, recordings=2, **flags):
             overfit=flag("overfit"),
             nonfinite=jnp.array(0),
         ),
-        calibration=Calibration(coverage90=jnp.array(0.9), widen=jnp.array(1.1), overconfident=flag("overconfident")),
+        calibration=Calibration(
+            coverage50=jnp.array(0.5),
+            coverage90=jnp.array(0.9),
+            coverage90_network=jnp.array(0.8),
+            widen=jnp.array(1.1),
+            overconfident=flag("overconfident"),
+        ),
         learning=Learning(return_mean=jnp.array(10.0 * index), nonfinite=jnp.array(0)),
         return_target=jnp.array(20.0 * index),
         diverged=jnp.array(0),
