@@ -35,6 +35,7 @@ def box_probability(
     return jax.vmap(log_probability)(means, scale_trils)
 
 
+@jax.jit
 def condition(
     mean: Float[Array, " d"],
     scale_tril: Float[Array, "d d"],

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -22,22 +24,29 @@ _MOMENT_POINTS = 1024
 class Truncated:
     """p(θ) = s U(θ; box) + (1 − s) q(θ) 1[θ ∈ box] / ∫_box q, with q a Gaussian mixture and s the prior's share.
 
-    With s = 1 it is the uniform prior: prior, proposal and posterior are one type and one scan carry.
+    With s = 1 it is the uniform prior: prior, proposal and posterior are one type and one scan carry. Make one with
+    `uniform` or `create`: the masses in the box are computed once, there.
     """
 
     mixture: GaussianMixture
     box: Box
     prior_share: Scalar
+    log_shares: Float[Array, " components"]
+    """For each component the log of αₖ Zₖ, with Zₖ its mass in the box."""
 
     @classmethod
     def uniform(cls, box: Box, components: int) -> Truncated:
         """The uniform prior on the box, in the shape of a posterior with that many components."""
-        return cls(_idle(box, components), box, jnp.ones((), box.low.dtype))
+        mixture = _idle(box, components)
+        within = box.size * math.log(math.erf(math.sqrt(1.5)))  # of N(0, 1) on ±√3, axis by axis
+        return cls(mixture, box, jnp.ones((), box.low.dtype), jax.nn.log_softmax(mixture.log_weights) + within)
 
     @classmethod
     def create(cls, mixture: GaussianMixture, box: Box, prior_share: float | Scalar = 0.0) -> Truncated:
         """Cut a mixture to the box. One with no representable mass in it gives the prior, told by `prior_share` = 1."""
-        whole = cls(mixture, box, jnp.asarray(prior_share, box.low.dtype))
+        masses = box_probability(mixture.means, mixture.scale_trils, box.low, box.high)
+        log_shares = jax.nn.log_softmax(mixture.log_weights) + masses
+        whole = cls(mixture, box, jnp.asarray(prior_share, box.low.dtype), log_shares)
         sound = jnp.isfinite(whole.log_mass())
         for leaf in jax.tree.leaves(mixture):
             sound &= ~jnp.isnan(leaf).any()
@@ -46,7 +55,7 @@ class Truncated:
 
     def log_mass(self) -> Scalar:
         """The log of ∫_box q(θ) dθ: how much of the mixture the box holds."""
-        return jax.nn.logsumexp(self._log_shares())
+        return jax.nn.logsumexp(self.log_shares)
 
     def sample(self, key: PRNGKeyArray) -> Float[Array, " d"]:
         """One draw of θ, strictly inside the box and without atoms on its bounds.
@@ -59,7 +68,7 @@ class Truncated:
         d, low, high = self.box.size, self.box.low, self.box.high
         draws = jax.random.uniform(key, (2 * d + 3,), low.dtype)
         shift, flat, (which, kept, share) = draws[:d], draws[d : 2 * d], draws[2 * d :]
-        index = _pick(which, self._log_shares())
+        index = _pick(which, self.log_shares)
         edge = jnp.finfo(low.dtype).eps
         u = jnp.mod(lattice(_CANDIDATES if d > 1 else 1, d) + shift, 1.0).clip(edge, 1 - edge)
         mean, scale_tril = self.mixture.means[index], self.mixture.scale_trils[index]
@@ -108,11 +117,6 @@ class Truncated:
         cut = jax.vmap(unnormalized)(grid) - self.log_mass()
         inside = (grid >= low[0]) & (grid <= high[0])
         return jnp.where(inside, self._blend(-jnp.log(high[0] - low[0]), cut), -jnp.inf)
-
-    def _log_shares(self) -> Float[Array, " components"]:
-        """For each component the log of αₖ Zₖ, Zₖ the mass its mass in the box."""
-        masses = box_probability(self.mixture.means, self.mixture.scale_trils, self.box.low, self.box.high)
-        return jax.nn.log_softmax(self.mixture.log_weights) + masses
 
     def _blend(self, flat: Scalar, cut: Float[Array, "..."]) -> Float[Array, "..."]:
         return jnp.logaddexp(_log(self.prior_share) + flat, _log(1 - self.prior_share) + cut)

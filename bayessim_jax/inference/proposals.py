@@ -83,7 +83,7 @@ class Corrected:
         """The widened Gaussian; the prior itself while the belief is the prior."""
         mean, scale_tril = moment_match(belief.mixture)
         wide = GaussianMixture(jnp.zeros(1), mean[None], self.widening * scale_tril[None])
-        return Truncated(wide, belief.box, belief.prior_share)
+        return Truncated.create(wide, belief.box, belief.prior_share)
 
     def combine(self, belief: Truncated, proposal: Truncated, q: GaussianMixture) -> Truncated:
         """The quotient q / p̃ on the prior's box; q itself where p̃ was the prior."""

@@ -1,0 +1,96 @@
+"""Control on the target after the last round, beside two references trained with as many policy steps.
+
+    python scripts/control.py --systems cartpole pendulum acrobot --runs 6
+
+Each run hides its own θ*, drawn from the prior, in Gymnasium's environment, and judges three deterministic policies on
+100 episodes of the task's full length with the same resets: `online` was trained in the loop, `uniform` on the prior
+(domain randomization without inference), `truth` on θ* itself (the ceiling). `whole` is the share of episodes that last
+to the time limit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from trials import save
+
+from bayessim_jax import online
+from bayessim_jax.beliefs import Uniform
+from bayessim_jax.contracts import Belief, Box
+from bayessim_jax.engines import gymnasium_target
+from bayessim_jax.learning import default_learner
+from bayessim_jax.systems import SYSTEMS, lookup
+
+
+def main() -> None:
+    """Run the systems asked for and print a table for each."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--systems", nargs="+", choices=SYSTEMS, default=list(SYSTEMS))
+    parser.add_argument("--runs", type=int, default=6)
+    parser.add_argument("--rounds", type=int, default=30)
+    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, help="append every run to this file of JSON lines")
+    args = parser.parse_args()
+    for name in args.systems:
+        rows: list[dict[str, Any]] = []
+        for result in _runs(name, args.runs, args.rounds, args.episodes, args.seed):
+            rows.append(result)
+            print(f"{name} {len(rows)}/{args.runs}: {result['seconds']:.0f} s", end="\r", flush=True)
+            if args.out:
+                save(args.out, result | {"system": name})
+        print(f"{name}: {args.runs} runs of {args.rounds} rounds, {args.episodes} episodes each" + 20 * " ")
+        for way in ("online", "uniform", "truth"):
+            means = np.array([r[way]["return"] for r in rows])
+            ratio = np.array([r[way]["return"] / r["truth"]["return"] for r in rows])
+            whole = np.array([r[way]["whole"] for r in rows])
+            print(
+                f"  {way:8s} return {means.mean():8.1f} ± {means.std():.1f} over runs, worst {means.min():8.1f}; "
+                f"over the ceiling's, median {np.median(ratio):.3f}; whole episodes {whole.mean():.3f}, "
+                f"least {whole.min():.2f}"
+            )
+
+
+def _runs(name: str, runs: int, rounds: int, episodes: int, seed: int) -> Any:
+    entry = lookup(name)
+    system, task = entry.system(), entry.task()
+    learner, box = default_learner(name, system, task), system.parameters
+    setup = online.Setup.create(system, learner, task)
+    run = jax.jit(online.run, static_argnames="rounds")
+
+    @jax.jit
+    def train(key: Any, belief: Belief) -> Any:
+        """As many policy steps as in the loop, all of them on one belief."""
+        first, *later = jax.random.split(key, rounds + 1)
+        state = learner.init(first)
+        return jax.lax.scan(lambda s, k: (learner.step(k, s, belief)[0], None), state, jnp.stack(later))[0]
+
+    @jax.jit
+    def judge(key: Any, target: Any, state: Any) -> dict[str, Any]:
+        policy = learner.policy(state, deterministic=True)
+        seen = jax.vmap(lambda k: target.record(k, policy, task.steps))(jax.random.split(key, episodes))
+        return {"return": seen.rewards.sum(-1).mean(), "whole": seen.valid.all(-1).mean()}
+
+    for index in range(runs):
+        start = time.monotonic()
+        truth_key, run_key, judge_key = jax.random.split(jax.random.fold_in(jax.random.key(seed), index), 3)
+        truth = jax.random.uniform(truth_key, box.low.shape, minval=box.low, maxval=box.high)
+        target = gymnasium_target(name, truth, system.noise)
+        known = Uniform(Box(truth - 1e-3 * box.width, truth + 1e-3 * box.width, box.names, box.units))
+        states = {
+            "online": run(run_key, setup, target, rounds=rounds)[0].learner,
+            "uniform": train(run_key, Uniform(box)),
+            "truth": train(run_key, known),
+        }
+        judged = {way: jax.tree.map(float, judge(judge_key, target, state)) for way, state in states.items()}
+        yield judged | {"run": index, "truth_values": np.asarray(truth), "seconds": time.monotonic() - start}
+
+
+if __name__ == "__main__":
+    main()
