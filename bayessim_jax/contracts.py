@@ -204,11 +204,13 @@ class Estimator(Protocol[E]):
         thetas: Float[Array, "n d"],
         recordings: Recording,
         use: Bool[Array, " set"],
+        box: Box,
         correct: bool = True,
     ) -> tuple[E, Any]:
         """Correct the posterior of sets on sets that were never trained on (leading axes of recordings: n, set).
 
-        Without `correct` the posterior is only judged. Info holds `coverage50`, `coverage90` and `overconfident`.
+        `box` is the prior's support, to which posteriors are cut before they are judged. Without `correct` the
+        posterior is only judged. Info holds `coverage50`, `coverage90` and `overconfident`.
         """
         ...
 

@@ -258,7 +258,7 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
     set_keys = jax.random.split(jax.random.fold_in(calibrate_key, 0), use.size)
     sets = jax.vmap(lambda k, p: simulate(k, setup, p, thetas[fresh:]), out_axes=1)(set_keys, policies)
     estimator, calibration = setup.estimator.calibrate(
-        calibrate_key, estimator, thetas[fresh:], sets, use, correct=setup.proposal.accumulate
+        calibrate_key, estimator, thetas[fresh:], sets, use, state.belief.box, correct=setup.proposal.accumulate
     )
     q = setup.estimator.posterior(estimator, history, use)
     posterior = setup.proposal.combine(state.belief, proposal, q)

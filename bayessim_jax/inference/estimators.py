@@ -11,7 +11,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from bayessim_jax.beliefs import GaussianMixture
-from bayessim_jax.contracts import Recording, Scalar
+from bayessim_jax.contracts import Box, Recording, Scalar
 from bayessim_jax.inference.encoders import Encoder, lookup_encoder, transition_features
 from bayessim_jax.inference.evidence import Recalibration, combine_evidence, credible_level, recalibrate
 from bayessim_jax.inference.fit import FitInfo, Schedule, fit
@@ -50,7 +50,7 @@ class CalibrationInfo:
     coverage90_network: Scalar
     """Share of truths inside the 90 % credible set of the networks' posterior, before recalibration."""
     coverage50: Scalar
-    """The same for 50 % sets after recalibration, each half of the sets corrected by what the other half says."""
+    """The same for 50 % sets after recalibration, each half of the sets corrected by a regression on the other half."""
     coverage90: Scalar
     """And for 90 % sets."""
     widen: Scalar
@@ -151,6 +151,7 @@ class MixtureDensity:
         thetas: Float[Array, "n d"],
         recordings: Recording,
         use: Bool[Array, " set"],
+        box: Box,
         correct: bool = True,
     ) -> tuple[EstimatorState, CalibrationInfo]:
         """Measure the posterior of sets on sets that no network has seen, and take out what is wrong with it."""
@@ -160,20 +161,13 @@ class MixtureDensity:
         plain = jax.lax.map(
             lambda one: self._combined(state.params, one[0], one[1] & one[2][:, None], one[2]), (x, valid, sound)
         )
-        n = z.shape[0]
-        before = credible_level(key, plain, z)
+        low, high = ((bound - state.shift) / state.scale for bound in (box.low, box.high))
+        before = credible_level(key, plain, z, low, high)
         if not correct:
             return state, _judge(before, before, jnp.ones(()))
-        even = jnp.arange(n) % 2 == 0
-        # the correction to keep is learned from every set; each half is judged with what the other half says
-        halves = jnp.stack([jnp.ones(n), ~even, even]).astype(float)
-        found = jax.vmap(recalibrate, (None, None, 0))(plain, z, halves)
-        whole = jax.tree.map(lambda leaf: leaf[0], found)
-        other = jax.tree.map(lambda leaf: leaf[jnp.where(even, 1, 2)], found)
-        crossed = jax.vmap(lambda correction, q: correction.apply(q))(other, plain)
-        after = credible_level(key, crossed, z)
-        widen = jnp.exp(jnp.log(jnp.diagonal(whole.stretch)).mean())
-        return replace(state, recalibration=whole), _judge(before, after, widen)
+        recalibration, after = recalibrate(key, plain, z, low, high)
+        widen = jnp.exp(jnp.log(jnp.diagonal(recalibration.stretch)).mean()) * recalibration.inflation
+        return replace(state, recalibration=recalibration), _judge(before, after, widen)
 
     def posterior(self, state: EstimatorState, recordings: Recording, use: Bool[Array, " set"]) -> GaussianMixture:
         """The mixture q(θ | recordings in use), for one set, in the units of θ."""

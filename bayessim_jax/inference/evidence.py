@@ -12,7 +12,10 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from bayessim_jax.beliefs import GaussianMixture, moment_match
 from bayessim_jax.contracts import Scalar
 
-__all__ = ["Recalibration", "combine_evidence", "credible_level", "recalibrate"]
+__all__ = ["INFLATIONS", "Recalibration", "combine_evidence", "credible_level", "inflate", "recalibrate", "regress"]
+
+INFLATIONS = (1.0, 1.1, 1.2, 1.35, 1.5, 1.75, 2.0, 2.5)
+"""By how much a recalibrated posterior may be widened at the end."""
 
 
 def combine_evidence(each: GaussianMixture, use: Bool[Array, " set"]) -> GaussianMixture:
@@ -43,7 +46,7 @@ def combine_evidence(each: GaussianMixture, use: Bool[Array, " set"]) -> Gaussia
 
 @struct.dataclass
 class Recalibration:
-    """A correction of a posterior in the coordinates that its own moments whiten: a shift and a stretch.
+    """A correction of a posterior in the coordinates that its own moments whiten: a shift, a stretch, an inflation.
 
     The shift is linear in where the posterior sits, shift = (1, x) · slopes with x = (mean − origin)/unit, |x| ≤ 3.
     """
@@ -53,42 +56,51 @@ class Recalibration:
     slopes: Float[Array, "1+d d"]
     stretch: Float[Array, "d d"]
     """Lower triangular."""
+    inflation: Scalar
+    """Standard deviations after over before the last step, which adds to the covariance of every component."""
 
     @classmethod
     def none(cls, d: int) -> Recalibration:
         """The identity."""
-        return cls(jnp.zeros(d), jnp.ones(d), jnp.zeros((1 + d, d)), jnp.eye(d))
+        return cls(jnp.zeros(d), jnp.ones(d), jnp.zeros((1 + d, d)), jnp.eye(d), jnp.ones(()))
 
     def shift(self, mean: Float[Array, " d"]) -> Float[Array, " d"]:
         """By how many of its own standard deviations a posterior with this mean is off."""
         return self._features(mean) @ self.slopes
 
     def apply(self, mixture: GaussianMixture) -> GaussianMixture:
-        """θ ↦ μ + L (shift + stretch L⁻¹ (θ − μ)), with μ and L Lᵀ the mean and covariance of the mixture."""
+        """θ ↦ μ + L (shift + stretch L⁻¹ (θ − μ)), then each Σₖ + (inflation² − 1) S, S the covariance so far."""
         mean, tril = moment_match(mixture)
         inverse = jax.scipy.linalg.solve_triangular(tril, jnp.eye(mean.size), lower=True)
         linear = tril @ self.stretch @ inverse
-        return GaussianMixture(
+        moved = GaussianMixture(
             mixture.log_weights,
             mean + tril @ self.shift(mean) + (mixture.means - mean) @ linear.T,
             linear @ mixture.scale_trils,
         )
+        return inflate(moved, self.inflation)
 
     def _features(self, mean: Float[Array, " d"]) -> Float[Array, " 1+d"]:
         return jnp.concatenate([jnp.ones(1), jnp.clip((mean - self.origin) / self.unit, -3.0, 3.0)])
 
 
-def recalibrate(
+def inflate(mixture: GaussianMixture, factor: Scalar) -> GaussianMixture:
+    """Each Σₖ + (factor² − 1) S with S the covariance of the mixture: the whole is wider, its details blurred."""
+    _, tril = moment_match(mixture)
+    parts = mixture.scale_trils @ jnp.swapaxes(mixture.scale_trils, -1, -2)
+    return replace(mixture, scale_trils=jnp.linalg.cholesky(parts + (factor**2 - 1.0) * (tril @ tril.T)))
+
+
+def regress(
     mixtures: GaussianMixture, truths: Float[Array, "n d"], weights: Float[Array, " n"], pseudo: float = 3.0
 ) -> Recalibration:
-    """The correction that makes held-out truths look like draws of their posteriors; a weight of 0 leaves a pair out.
+    """The shift and the stretch that fit held-out truths to their posteriors; a weight of 0 leaves a pair out.
 
-    r = L⁻¹ (θ − μ) of a calibrated posterior has mean zero and covariance I wherever μ is, and ‖r‖² has the quantiles
-    of χ²(d). The shift is the regression of r on μ, with bounded residuals and shrunk by `pseudo` observations: it
-    takes out what the networks get wrong as a function of θ. The stretch has the shape of the covariance of what is
-    left, shrunk towards isotropy, and the size at which the quantiles at 50 % and 90 % agree (geometric mean of their
-    ratios) with the error of the regression added. It never narrows: a mixture with a sharp core and wide tails has
-    small quantiles without being too wide.
+    r = L⁻¹ (θ − μ) of a calibrated posterior has mean zero and covariance I wherever μ is. The shift is the regression
+    of r on μ, with bounded residuals and shrunk by `pseudo` observations: it takes out what the networks get wrong as
+    a function of θ. The stretch is the root of the covariance of what is left, shrunk towards isotropy, with the
+    error of the regression added. It never narrows on the whole: a mixture with a sharp core and wide tails has small
+    residuals without being too wide.
 
     Source: Blum and François 2010
     """
@@ -107,50 +119,72 @@ def recalibrate(
     where = replace(plain, origin=origin, unit=unit)
     x = jax.vmap(where._features)(means)
 
-    def regress(w: Array) -> tuple[Array, Array, Array]:
+    def solve(w: Array) -> tuple[Array, Array, Array]:
         gram = (x * w[:, None]).T @ x
         ridge = gram + pseudo * jnp.eye(1 + d)
         slopes = jnp.linalg.solve(ridge, (x * w[:, None]).T @ r)
         return slopes, r - x @ slopes, jnp.trace(jnp.linalg.solve(ridge, gram))
 
-    _, left, _ = regress(weights)
+    _, left, _ = solve(weights)
     spread = jnp.sqrt((share * left**2).sum(0))
     bound = jnp.minimum(1.0, 3.0 * jnp.sqrt(d) / jnp.maximum(jnp.linalg.norm(left / spread, axis=-1), 1e-6))
-    slopes, left, freedom = regress(weights * bound)
+    slopes, left, freedom = solve(weights * bound)
     covariance = (left * (weights * bound)[:, None]).T @ left / n
     shape = (n * covariance + 10.0 * jnp.trace(covariance) / d * jnp.eye(d)) / (n + 10.0)
     tril = jnp.linalg.cholesky(shape + 1e-6 * jnp.eye(d))
-    squared = (jax.scipy.linalg.solve_triangular(tril, left.T, lower=True) ** 2).sum(0)
-    levels = jnp.array([0.5, 0.9])
-    quantiles = jnp.nanquantile(jnp.where(weights > 0, squared, jnp.nan), levels)
-    factor = jnp.exp(0.5 * (jnp.log(quantiles) - jnp.log(_chi2_quantile(levels, d))).mean())
-    stretch = factor * jnp.sqrt((n + freedom) / (n - freedom)) * tril
+    stretch = jnp.sqrt((n + freedom) / (n - freedom)) * tril
     stretch = stretch / jnp.minimum(1.0, jnp.exp(jnp.log(jnp.diagonal(stretch)).mean()))
     found = replace(where, slopes=slopes, stretch=stretch)
     sound = jnp.isfinite(slopes).all() & jnp.isfinite(stretch).all()
     return jax.tree.map(lambda a, b: jnp.where(sound, a, b), found, plain)
 
 
-def _chi2_quantile(levels: Float[Array, " n"], d: int) -> Float[Array, " n"]:
-    """Quantiles of χ²(d) by bisection of the regularized incomplete gamma function."""
+def recalibrate(
+    key: PRNGKeyArray,
+    mixtures: GaussianMixture,
+    truths: Float[Array, "n d"],
+    low: Float[Array, " d"],
+    high: Float[Array, " d"],
+) -> tuple[Recalibration, Float[Array, " n"]]:
+    """The correction that makes held-out truths look like draws of their posteriors, and the levels that show it.
 
-    def halve(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = bounds
-        middle = 0.5 * (low + high)
-        below = jax.scipy.special.gammainc(d / 2, middle / 2) < levels
-        return jnp.where(below, middle, low), jnp.where(below, high, middle)
-
-    low, high = jax.lax.fori_loop(0, 40, halve, (jnp.zeros_like(levels), jnp.full_like(levels, 10.0 * d + 20.0)))
-    return 0.5 * (low + high)
+    `regress` on all pairs, then the least inflation of `INFLATIONS` at which the 50 % and the 90 % sets, cut to the
+    box, hold at least their share of the truths. It is chosen, and the credible levels returned are taken, on each half
+    of the pairs with the regression on the other half.
+    """
+    n = truths.shape[0]
+    even = jnp.arange(n) % 2 == 0
+    parts = jnp.stack([jnp.ones(n), ~even, even]).astype(float)
+    found = jax.vmap(regress, (None, None, 0))(mixtures, truths, parts)
+    whole = jax.tree.map(lambda leaf: leaf[0], found)
+    other = jax.tree.map(lambda leaf: leaf[jnp.where(even, 1, 2)], found)
+    crossed = jax.vmap(lambda correction, mixture: correction.apply(mixture))(other, mixtures)
+    factors = jnp.array(INFLATIONS)
+    levels = jax.lax.map(
+        lambda factor: credible_level(key, jax.vmap(inflate, (0, None))(crossed, factor), truths, low, high), factors
+    )
+    enough = ((levels <= 0.5).mean(-1) >= 0.5) & ((levels <= 0.9).mean(-1) >= 0.9)
+    least = jnp.where(enough.any(), jnp.argmax(enough), factors.size - 1)
+    return replace(whole, inflation=factors[least]), levels[least]
 
 
 def credible_level(
-    key: PRNGKeyArray, mixtures: GaussianMixture, truths: Float[Array, "n d"], draws: int = 128
+    key: PRNGKeyArray,
+    mixtures: GaussianMixture,
+    truths: Float[Array, "n d"],
+    low: Float[Array, " d"],
+    high: Float[Array, " d"],
+    draws: int = 64,
 ) -> Float[Array, " n"]:
-    """Smallest highest-density credible level that holds the truth, estimated from draws; uniform if calibrated."""
+    """Smallest highest-density credible level that holds the truth; uniform if calibrated.
+
+    The mixtures are cut to the box from `low` to `high`; the level is estimated from the draws that fall in it.
+    """
 
     def one(key: PRNGKeyArray, mixture: GaussianMixture, truth: Array) -> Scalar:
         samples = jax.vmap(mixture.sample)(jax.random.split(key, draws))
-        return (jax.vmap(mixture.log_prob)(samples) > mixture.log_prob(truth)).mean()
+        inside = ((samples >= low) & (samples <= high)).all(-1)
+        denser = jax.vmap(mixture.log_prob)(samples) > mixture.log_prob(truth)
+        return (denser & inside).sum() / jnp.maximum(inside.sum(), 1)
 
     return jax.vmap(one)(jax.random.split(key, truths.shape[0]), mixtures, truths)

@@ -124,7 +124,7 @@ def _calibration(run: OnlineRun) -> list[str]:
     svg = coverage_plot(run.series("coverage90"), run.series("log_q_train"), run.series("log_q_validation"), *flags)
     caption = (
         "Left: how many of the simulated sets that were kept out of training lie inside their own 90 % credible set "
-        "(each half is recalibrated by the other). Right: the score on simulations trained on and held "
+        "(each half corrected by the other). Right: the score on simulations trained on and held "
         "out; a widening gap is over-fitting. Orange crosses mark rounds that raised a flag."
     )
     parts = [html.figure(svg, "Coverage on held-out simulations and fit scores against rounds.", caption, wide=True)]
