@@ -9,7 +9,7 @@ from bayessim_jax.contracts import Box
 from bayessim_jax.engines.simulated import SimulatedTarget
 from bayessim_jax.inference import Lstm, MixtureHead, Schedule, recurrent_mixture
 from bayessim_jax.inference.estimators import MixtureDensity
-from bayessim_jax.learning import Fixed, Ppo, RandomPolicy
+from bayessim_jax.learning import Fixed, Ppo, RandomPolicy, default_learner
 from bayessim_jax.systems import Balance, CartPole, from_functions
 
 TINY = MixtureDensity(Lstm(8, 4), MixtureHead(2, 8), Schedule(epochs=10, draws=32, batch=16), members=1, folds=4)
@@ -45,8 +45,7 @@ def _same(a, b):
     return all(bool(jnp.array_equal(x, y, equal_nan=jnp.issubdtype(x.dtype, jnp.floating))) for x, y in leaves)
 
 
-def test_chunks_and_a_python_loop_are_the_whole_run_bit_for_bit(cartpole, run):
-    setup, target = cartpole
+def _check_that_cuts_change_nothing(setup, target, run):
     key = jax.random.key(3)
     keys = online.split(key)
     start = jax.jit(online.init)(keys.init, setup)
@@ -64,6 +63,17 @@ def test_chunks_and_a_python_loop_are_the_whole_run_bit_for_bit(cartpole, run):
     for _ in range(4):
         state, _ = update(keys.update, setup, state, record(keys.record, setup, target, state))
     assert _same(whole, state)
+
+
+def test_chunks_and_a_python_loop_are_the_whole_run_bit_for_bit(cartpole, run):
+    _check_that_cuts_change_nothing(*cartpole, run)
+
+
+@pytest.mark.slow
+def test_chunks_and_a_python_loop_are_the_whole_run_at_the_paper_s_sizes(run):
+    system, task = CartPole.create(), Balance(steps=500)
+    setup = online.Setup.create(system, default_learner("cartpole", system, task), task)
+    _check_that_cuts_change_nothing(setup, SimulatedTarget(system, task, jnp.array([0.5, 0.3])), run)
 
 
 def test_seeds_batch_and_a_new_truth_does_not_recompile(cartpole):
