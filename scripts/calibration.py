@@ -13,7 +13,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from trials import save, trials
+from trials import trials
 
 from bayessim_jax import online
 from bayessim_jax.inference import PROPOSALS
@@ -31,7 +31,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=10)
     parser.add_argument("--recordings", type=int, default=1, help="of the target, in each round")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, help="append every run to this file of JSON lines")
+    parser.add_argument("--out", type=Path, help="file of JSON lines to append runs to, and to resume from")
     args = parser.parse_args()
 
     entry = lookup(args.system)
@@ -46,10 +46,9 @@ def main() -> None:
         evaluations=0,
     )
     results = []
-    for result in trials(setup, args.runs, args.rounds, args.seed):
+    labels = {"system": args.system, "proposal": args.proposal, "recordings": args.recordings}
+    for result in trials(setup, args.runs, args.rounds, args.seed, out=args.out, labels=labels):
         results.append(result)
-        if args.out:
-            save(args.out, result)
         print(f"run {len(results)}/{args.runs}: {result['seconds']:.1f} s", end="\r", flush=True)
     print()
     log_q, level, rank = (np.stack([r[name] for r in results]) for name in ("log_q", "level", "rank"))

@@ -16,7 +16,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from trials import save, trials
+from trials import trials
 
 from bayessim_jax import online
 from bayessim_jax.inference import fourier_mixture, recurrent_mixture, summary_mixture
@@ -40,7 +40,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--rounds", type=int, default=30)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, help="append every run to this file of JSON lines")
+    parser.add_argument("--out", type=Path, help="file of JSON lines to append runs to, and to resume from")
     args = parser.parse_args()
     for row in args.rows:
         entry = lookup(row)
@@ -51,11 +51,10 @@ def main() -> None:
                 system, default_learner(row, system, task), task, estimator=estimator(), proposal=proposal
             )
             results = []
-            for result in trials(setup, args.runs, args.rounds, args.seed):
+            labels = {"row": row, "column": column}
+            for result in trials(setup, args.runs, args.rounds, args.seed, out=args.out, labels=labels):
                 results.append(result)
                 print(f"{row} {column} {len(results)}/{args.runs}: {result['seconds']:.0f} s", end="\r", flush=True)
-                if args.out:
-                    save(args.out, result | {"row": row, "column": column})
             last = np.stack([r["log_q"][-1] for r in results])
             level = np.stack([r["level"][-1] for r in results])
             width = np.log(np.asarray(system.parameters.width)).sum()

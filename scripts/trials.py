@@ -18,8 +18,20 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-def trials(setup: online.Setup, runs: int, rounds: int, seed: int = 0, draws: int = 512) -> Iterator[dict[str, Any]]:
+def trials(
+    setup: online.Setup,
+    runs: int,
+    rounds: int,
+    seed: int = 0,
+    *,
+    out: Path | None = None,
+    labels: dict[str, Any] | None = None,
+    draws: int = 512,
+) -> Iterator[dict[str, Any]]:
     """Yield, for each run, arrays over rounds: log q(θ*), the credible level and the ranks of θ*, mean log marginals.
+
+    With `out` every run is appended to that file of JSON lines, and runs that it holds already under the same `labels`,
+    seed and rounds are taken from there.
 
     `level` is the smallest highest-density credible level that holds θ*: uniform if calibrated. `rank` is the share of
     posterior draws below θ*, per axis. `log_marginals` are normal scores of pairs of axes (0, 1), (2, 3), ….
@@ -49,19 +61,44 @@ def trials(setup: online.Setup, runs: int, rounds: int, seed: int = 0, draws: in
         return judged | {
             "truth": truth,
             "return_target": infos.return_target,
+            "coverage50": infos.calibration.coverage50,
             "coverage90": infos.calibration.coverage90,
+            "coverage90_network": infos.calibration.coverage90_network,
             "diverged": infos.diverged,
         }
 
     compiled = jax.jit(one)
+    labels = (labels or {}) | {"seed": seed, "rounds": rounds}
+    known = {result["run"]: result for result in load(out, labels)} if out else {}
     for index in range(runs):
-        start = time.monotonic()
-        result = jax.block_until_ready(compiled(jax.random.fold_in(jax.random.key(seed), index)))
-        yield jax.tree.map(np.asarray, result) | {"run": index, "seconds": time.monotonic() - start}
+        if index not in known:
+            start = time.monotonic()
+            result = jax.block_until_ready(compiled(jax.random.fold_in(jax.random.key(seed), index)))
+            seconds = time.monotonic() - start
+            known[index] = jax.tree.map(np.asarray, result) | {"run": index, "seconds": seconds}
+            if out:
+                save(out, labels | known[index])
+        yield known[index]
 
 
 def save(path: Path, result: dict[str, Any]) -> None:
-    """Append one run as a line of JSON."""
-    plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in result.items()}
+    """Append one run as a line of JSON, arrays to four decimals."""
+    plain = {
+        name: np.round(value.astype(float), 4).tolist() if isinstance(value, np.ndarray) else value
+        for name, value in result.items()
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(plain) + "\n")
+
+
+def load(path: Path, labels: dict[str, Any]) -> list[dict[str, Any]]:
+    """The runs of a file that carry these labels."""
+    if not path.exists():
+        return []
+    found = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        row = json.loads(line)
+        if all(row.get(name) == value for name, value in labels.items()):
+            found.append({k: np.asarray(v) if isinstance(v, list) else v for k, v in row.items()})
+    return found
