@@ -17,7 +17,7 @@ def main() -> None:
     online.add_argument("--repeats", type=int, default=3)
     online.add_argument("--held-out", type=int, default=500)
     online.add_argument("--ladder", type=int, nargs="+", default=[10, 20, 40, 80, 200], help="epochs of our fit to try")
-    online.add_argument("--encoder", default="framed_lstm", help="of our fit to the same held-out log q")
+    online.add_argument("--encoder", default="pooled_lstm", help="of our fit to the same held-out log q")
     online.add_argument("--members", type=int, default=4, help="networks in the ensemble of that fit")
     _add_common(online)
 
@@ -27,7 +27,7 @@ def main() -> None:
     estimator.add_argument("--held-out", type=int, default=500)
     estimator.add_argument("--epochs", type=int, default=20)
     estimator.add_argument("--members", type=int, default=4, help="networks in our ensemble")
-    estimator.add_argument("--encoders", nargs="+", default=["framed_lstm"])
+    estimator.add_argument("--encoders", nargs="+", default=["pooled_lstm"])
     estimator.add_argument("--models", nargs="+", default=["mdn", "maf"], help="sbi's density estimators")
     _add_common(estimator)
 

@@ -12,7 +12,7 @@ from bayessim_jax.inference.estimators import MixtureDensity
 from bayessim_jax.learning import Fixed, Ppo, RandomPolicy, default_learner
 from bayessim_jax.systems import Balance, CartPole, from_functions
 
-TINY = MixtureDensity(Lstm(8, 4), MixtureHead(2, 8), Schedule(epochs=10, draws=32, batch=16), members=1, folds=4)
+TINY = MixtureDensity(Lstm(8, frame=4), MixtureHead(2, 8), Schedule(epochs=10, draws=32, batch=16), members=1, folds=4)
 
 
 @pytest.fixture(scope="module")

@@ -58,8 +58,8 @@ class Settings:
     """Seed of everything random; with several seeds, the first of them."""
     seeds: int = 1
     """Runs at once, each with its own seed and truth, to show the spread."""
-    encoder: Literal["framed_lstm", "lstm", "fourier", "summary"] = "framed_lstm"
-    """How a recording is read: a fast LSTM over short frames, the paper's LSTM, or hand-made summaries with and
+    encoder: Literal["pooled_lstm", "lstm", "fourier", "summary"] = "pooled_lstm"
+    """How a recording is read: a fast LSTM over pooled frames, the paper's LSTM, or hand-made summaries with and
     without random Fourier features (the BayesSim RFF and epsilon-free baselines)."""
     proposal: Literal["corrected", "paper", "truncated"] = "corrected"
     """Where to simulate in the next round: the paper's mode, with the proposal divided out, or the truncated prior."""

@@ -43,16 +43,17 @@ def transition_features(recording: Recording) -> Float[Array, "steps features"]:
     return jnp.where(recording.valid[:, None], x, 0.0)
 
 
-def frames(
+def pool(
     x: Float[Array, "batch steps features"], valid: Bool[Array, "batch steps"], frame: int
-) -> tuple[Float[Array, "batch tokens inputs"], Bool[Array, "batch tokens"]]:
-    """Join every `frame` successive steps into one token, valid where at least one of its steps is."""
+) -> tuple[Float[Array, "batch frames features"], Bool[Array, "batch frames"]]:
+    """Means over the valid ones of every `frame` successive steps; a frame is valid where at least one step is."""
     batch, steps, features = x.shape
-    frame = min(frame, steps)
-    tokens = -(-steps // frame)
-    pad = tokens * frame - steps
-    x = jnp.pad(x, ((0, 0), (0, pad), (0, 0))).reshape(batch, tokens, frame * features)
-    return x, jnp.pad(valid, ((0, 0), (0, pad))).reshape(batch, tokens, frame).any(-1)
+    count = -(-steps // frame)
+    pad = count * frame - steps
+    on = jnp.pad(valid, ((0, 0), (0, pad))).reshape(batch, count, frame)
+    x = jnp.pad(x, ((0, 0), (0, pad), (0, 0))).reshape(batch, count, frame, features)
+    mean = jnp.where(on[..., None], x, 0.0).sum(2) / jnp.maximum(on.sum(2), 1)[..., None]
+    return mean, on.any(-1)
 
 
 def glorot(key: PRNGKeyArray, rows: int, columns: int) -> Float[Array, "rows columns"]:
@@ -63,25 +64,34 @@ def glorot(key: PRNGKeyArray, rows: int, columns: int) -> Float[Array, "rows col
 
 @struct.dataclass
 class Lstm:
-    """The paper's encoder: a long short-term memory, read out after the last valid step.
+    """The paper's encoder: a long short-term memory, here read out as the mean of its hidden states.
 
         s' = σ(f) s + σ(i) tanh(c),   h' = σ(o) tanh(s'),   (i, f, o, c) = W x + U h + b
 
-    Invalid steps leave h and s as they are.
+    Every transition says something about θ, so the mean over them learns from far fewer recordings than the state after
+    the last one does. Before the recurrence, layers that all steps share can read each transition (`widths`), and
+    their outputs can be averaged over frames of steps (`frame`), which makes the recurrence as many times shorter.
+    Invalid steps leave h and s as they are and do not count in a mean.
 
     Source: Hochreiter and Schmidhuber 1997
     """
 
     size: int = struct.field(pytree_node=False, default=64)
+    widths: tuple[int, ...] = struct.field(pytree_node=False, default=())
+    """Layers x ← gelu(W x + b) that read each step."""
     frame: int = struct.field(pytree_node=False, default=1)
-    """Successive steps that are read at once: a recurrence of 50/frame steps is that much faster."""
+    """Successive steps whose readings are averaged."""
 
-    def init(self, key: PRNGKeyArray, steps: int, features: int) -> dict[str, Array]:
+    def init(self, key: PRNGKeyArray, steps: int, features: int) -> dict[str, Any]:
         """Glorot weights, and a forget gate that starts open."""
-        w_key, u_key = jax.random.split(key)
+        w_key, u_key, *keys = jax.random.split(key, 2 + len(self.widths))
+        inputs = (features, *self.widths)
         h = self.size
         return {
-            "w": glorot(w_key, min(self.frame, steps) * features, 4 * h),
+            "read": [
+                {"w": glorot(k, a, b), "b": jnp.zeros(b)} for k, a, b in zip(keys, inputs, self.widths, strict=False)
+            ],
+            "w": glorot(w_key, inputs[-1], 4 * h),
             "u": glorot(u_key, h, 4 * h),
             "b": jnp.zeros(4 * h).at[h : 2 * h].set(1.0),
         }
@@ -89,9 +99,12 @@ class Lstm:
     def apply(
         self, params: Any, x: Float[Array, "batch steps features"], valid: Bool[Array, "batch steps"]
     ) -> Float[Array, "batch size"]:
-        """The hidden state after the last valid step."""
+        """The mean of the hidden states after valid steps."""
         h = self.size
-        x, valid = frames(x, valid, self.frame)
+        for layer in params["read"]:
+            x = jax.nn.gelu(x @ layer["w"] + layer["b"])
+        if self.frame > 1:
+            x, valid = pool(x, valid, self.frame)
         # σ(a) = ½ + ½ tanh(a/2): with the halves folded into the weights all four gates are one tanh
         half = jnp.concatenate([jnp.full(3 * h, 0.5), jnp.ones(h)])
         inputs = jnp.swapaxes(x, 0, 1) @ (params["w"] * half) + params["b"] * half
@@ -111,31 +124,32 @@ def _lstm(u: Float[Array, "h gates"], inputs: Float[Array, "steps batch gates"],
 def _lstm_forward(u: Array, inputs: Array, valid: Array) -> tuple[Array, Any]:
     # The barriers keep XLA from computing each tanh once for every use of it, which doubled the time of a step.
     barrier = jax.lax.optimization_barrier
+    share = valid / jnp.maximum(valid.sum(0), 1).astype(inputs.dtype)
 
     def step(carry: Any, x: Any) -> Any:
-        h, s = carry
-        z, on = x
+        h, s, mean = carry
+        z, on, share = x
         t = barrier(jnp.tanh(z + h @ u))
         i, f, o, c = _gates(t)
         s_next = barrier(f * s + i * c)
         bounded = jnp.tanh(s_next)
-        on = on[:, None]
-        return (jnp.where(on, o * bounded, h), jnp.where(on, s_next, s)), (h, s, t, bounded)
+        h_next, s_next = jnp.where(on[:, None], o * bounded, h), jnp.where(on[:, None], s_next, s)
+        return (h_next, s_next, mean + share[:, None] * h_next), (h, s, t, bounded)
 
     zeros = jnp.zeros((inputs.shape[1], u.shape[0]), inputs.dtype)
-    (h, _), saved = jax.lax.scan(step, (zeros, zeros), (inputs, valid))
-    return h, (u, valid, saved)
+    (_, _, mean), saved = jax.lax.scan(step, (zeros, zeros, zeros), (inputs, valid, share))
+    return mean, (u, valid, share, saved)
 
 
-def _lstm_backward(residuals: Any, dh: Array) -> tuple[Array, Array, None]:
-    u, valid, (hs, ss, ts, boundeds) = residuals
+def _lstm_backward(residuals: Any, dmean: Array) -> tuple[Array, Array, None]:
+    u, valid, share, (hs, ss, ts, boundeds) = residuals
     barrier = jax.lax.optimization_barrier
     u_transposed = u.T
 
     def step(carry: Any, x: Any) -> Any:
         dh, ds = carry
-        s, t, bounded, on = x
-        on = on[:, None]
+        s, t, bounded, on, share = x
+        on, dh = on[:, None], dh + share[:, None] * dmean
         i, f, o, c = _gates(t)
         dh_on, ds_on = jnp.where(on, dh, 0.0), jnp.where(on, ds, 0.0)
         ds_on = barrier(ds_on + dh_on * o * (1 - bounded * bounded))
@@ -143,7 +157,8 @@ def _lstm_backward(residuals: Any, dh: Array) -> tuple[Array, Array, None]:
         dz = barrier(left * (1 - t * t))
         return (dz @ u_transposed + jnp.where(on, 0.0, dh), ds_on * f + jnp.where(on, 0.0, ds)), dz
 
-    _, dzs = jax.lax.scan(step, (dh, jnp.zeros_like(dh)), (ss, ts, boundeds, valid), reverse=True)
+    zeros = jnp.zeros_like(dmean)
+    _, dzs = jax.lax.scan(step, (zeros, zeros), (ss, ts, boundeds, valid, share), reverse=True)
     # one large product after the loop, not one small one in every step
     du = hs.reshape(-1, hs.shape[-1]).T @ dzs.reshape(-1, dzs.shape[-1])
     return du, dzs, None
@@ -152,7 +167,7 @@ def _lstm_backward(residuals: Any, dh: Array) -> tuple[Array, Array, None]:
 _lstm.defvjp(_lstm_forward, _lstm_backward)
 
 
-ENCODERS: dict[str, Encoder] = {"framed_lstm": Lstm(size=32, frame=2), "lstm": Lstm()}
+ENCODERS: dict[str, Encoder] = {"pooled_lstm": Lstm(size=32, widths=(32, 32), frame=10), "lstm": Lstm()}
 
 
 def lookup_encoder(name: str) -> Encoder:

@@ -239,7 +239,7 @@ def _judge(before: Float[Array, " n"], after: Float[Array, " n"], widen: Scalar)
 
 
 def recurrent_mixture(
-    encoder: str | Encoder = "framed_lstm", components: int = 5, schedule: Schedule | None = None, **ensemble: int
+    encoder: str | Encoder = "pooled_lstm", components: int = 5, schedule: Schedule | None = None, **ensemble: int
 ) -> MixtureDensity:
     """The paper's estimator: a recurrent encoder and a mixture of Gaussians, trained jointly.
 

@@ -123,7 +123,7 @@ def test_a_run_of_another_configuration_is_not_continued(capsys, tmp_path):
     out = stored(tmp_path / "run")
     told = refused(capsys, "cartpole", "--seed", 4, "--encoder", "lstm", "--out", out, "--resume")
     assert "seed is 3 there and 4 in the command" in told
-    assert "encoder is 'framed_lstm' there and 'lstm' in the command" in told
+    assert "encoder is 'pooled_lstm' there and 'lstm' in the command" in told
     assert "system is 'cartpole' there" in refused(capsys, "pendulum", "--out", out, "--resume")
     assert "truth.mass is not set there and 0.3" in refused(
         capsys, "cartpole", "--truth", "mass=0.3", "--out", out, "--resume"

@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from bayessim_jax.inference.encoders import ENCODERS, Lstm, frames, lookup_encoder
+from bayessim_jax.inference.encoders import ENCODERS, Lstm, lookup_encoder, pool
 
 STEPS, FEATURES, BATCH = 12, 3, 5
 
@@ -17,14 +17,15 @@ def _data(key=0):
 def _naive_lstm(params, x, valid):
     """The textbook recurrence, differentiated by JAX."""
     h = jnp.zeros((x.shape[0], params["u"].shape[0]))
-    s = h
+    s = total = h
     for t in range(x.shape[1]):
         i, f, o, c = jnp.split(x[:, t] @ params["w"] + params["b"] + h @ params["u"], 4, axis=-1)
         s_new = jax.nn.sigmoid(f) * s + jax.nn.sigmoid(i) * jnp.tanh(c)
         h_new = jax.nn.sigmoid(o) * jnp.tanh(s_new)
         on = valid[:, t, None]
         h, s = jnp.where(on, h_new, h), jnp.where(on, s_new, s)
-    return h
+        total = total + jnp.where(on, h, 0.0)
+    return total / valid.sum(1, keepdims=True)
 
 
 def test_lstm_and_its_gradient_equal_the_textbook_recurrence():
@@ -52,12 +53,23 @@ def test_what_comes_after_the_end_does_not_change_the_embedding(name):
     assert a.shape[0] == BATCH
 
 
-def test_frames_join_successive_steps():
+def test_frames_are_means_over_their_valid_steps():
     x, valid = _data()
-    tokens, on = frames(x, valid, 5)
-    assert tokens.shape == (BATCH, 3, 5 * FEATURES)
-    assert jnp.array_equal(tokens[:, 0].reshape(BATCH, 5, FEATURES), x[:, :5])
-    assert jnp.array_equal(on, jnp.stack([valid[:, :5].any(1), valid[:, 5:10].any(1), valid[:, 10:].any(1)], 1))
+    means, on = pool(x, valid, 5)
+    assert means.shape == (BATCH, 3, FEATURES)
+    for i, k in [(0, 0), (1, 1), (2, 2)]:
+        kept = x[i, 5 * k : 5 * k + 5][valid[i, 5 * k : 5 * k + 5]]
+        assert jnp.allclose(means[i, k], kept.mean(0) if len(kept) else 0.0, atol=1e-6)
+        assert bool(on[i, k]) == bool(len(kept))
+
+
+def test_layers_that_read_each_step_come_before_the_recurrence():
+    x, valid = _data()
+    deep, plain = Lstm(size=7, widths=(6,)), Lstm(size=7)
+    params = deep.init(jax.random.key(3), STEPS, FEATURES)
+    (layer,) = params["read"]
+    read = jax.nn.gelu(x @ layer["w"] + layer["b"])
+    assert jnp.allclose(deep.apply(params, x, valid), plain.apply(params | {"read": []}, read, valid), atol=1e-6)
 
 
 def test_unknown_encoder_names_the_near_miss():
