@@ -143,6 +143,8 @@ class RoundInfo:
     """Simulations of this round that were masked because a number was not finite."""
     pool_size: Scalar
     """Effective number of simulations that the fit stood on, (Σ w)² / Σ w²."""
+    uninformed: Any
+    """The posterior of this round was wider than the belief and agreed with it, so the belief stayed."""
     collapsed: Any
     """The belief fell to less than a thousandth of its volume in one round while the estimator was over-confident."""
 
@@ -262,11 +264,13 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
     )
     q = setup.estimator.posterior(estimator, history, use)
     posterior = setup.proposal.combine(state.belief, proposal, q)
-    unusable = recordings.diverged.all()
-    belief = jax.tree.map(lambda old, new: jnp.where(unusable, old, new), state.belief, posterior)
+    growth, gap = _compare(state.belief, posterior)
+    # a fit that says less than was known, and does not contradict it, leaves the belief
+    uninformed = setup.proposal.accumulate & (growth > jnp.log(1.2)) & (gap < 2.0 * thetas.shape[1])
+    stays = recordings.diverged.all() | uninformed
+    belief = jax.tree.map(lambda old, new: jnp.where(stays, old, new), state.belief, posterior)
     learner, learning = setup.learner.step(learn_key, state.learner, belief)
 
-    shrinkage = _log_volume(belief) - _log_volume(state.belief)
     info = RoundInfo(
         belief=belief,
         recordings=recordings,
@@ -276,7 +280,8 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
         return_target=jnp.array(jnp.nan),
         diverged=simulated.diverged.sum(),
         pool_size=weights.sum() ** 2 / (weights**2).sum(),
-        collapsed=(shrinkage < -jnp.log(1e3)) & calibration.overconfident,
+        uninformed=uninformed,
+        collapsed=(growth < -jnp.log(1e3)) & calibration.overconfident,
     )
     after = State(state.round + 1, belief, estimator, learner, pool, history, policies)
     return jax.lax.optimization_barrier((after, info))
@@ -319,6 +324,8 @@ def _rows(leaf: Array) -> Array:
     return leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:])
 
 
-def _log_volume(belief: Truncated) -> Scalar:
-    """Half the log determinant of the covariance of the mixture."""
-    return 0.5 * jnp.linalg.slogdet(belief.mixture.covariance())[1]
+def _compare(old: Truncated, new: Truncated) -> tuple[Scalar, Scalar]:
+    """The log of the new volume over the old one, and the squared distance of the means in units of the new width."""
+    (old_mean, old_covariance), (new_mean, new_covariance) = old.moments(), new.moments()
+    log_ratio = 0.5 * (jnp.linalg.slogdet(new_covariance)[1] - jnp.linalg.slogdet(old_covariance)[1])
+    return log_ratio, (new_mean - old_mean) @ jnp.linalg.solve(new_covariance, new_mean - old_mean)

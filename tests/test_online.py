@@ -3,12 +3,15 @@
 import jax
 import jax.numpy as jnp
 import pytest
+from flax import struct
 
 from bayessim_jax import online
+from bayessim_jax.beliefs import GaussianMixture, Truncated
 from bayessim_jax.contracts import Box
 from bayessim_jax.engines.simulated import SimulatedTarget
 from bayessim_jax.inference import Lstm, MixtureHead, Schedule, recurrent_mixture
 from bayessim_jax.inference.estimators import MixtureDensity
+from bayessim_jax.inference.proposals import Corrected
 from bayessim_jax.learning import Fixed, Ppo, RandomPolicy, default_learner
 from bayessim_jax.systems import Balance, CartPole, from_functions
 
@@ -171,3 +174,31 @@ def test_wrong_shapes_and_sizes_are_told_in_one_line(cartpole):
 def test_the_default_estimator_is_the_recurrent_mixture(cartpole):
     setup, _ = cartpole
     assert online.Setup.create(setup.system, setup.learner).estimator == recurrent_mixture()
+
+
+def test_a_wider_posterior_that_agrees_leaves_the_belief_and_one_that_disagrees_replaces_it(cartpole):
+    setup, target = cartpole
+    box = setup.system.parameters
+
+    def belief(mean, sd):
+        mixture = GaussianMixture(jnp.zeros(2), jnp.array([mean, mean]), jnp.stack([sd * jnp.eye(2)] * 2))
+        return Truncated.create(mixture, box)
+
+    @struct.dataclass
+    class Given(Corrected):
+        """A proposal mode whose posterior is given."""
+
+        answer: Truncated | None = None
+
+        def combine(self, belief, proposal, q):
+            return self.answer
+
+    known = belief([0.5, 0.5], 0.02)
+    state = jax.jit(online.init)(jax.random.key(0), setup).replace(belief=known)
+    recordings = jax.jit(online.record)(jax.random.key(1), setup, target, state)
+    update = jax.jit(online.update)
+    for mean, sd, stays in [([0.52, 0.5], 0.05, True), ([0.8, 0.2], 0.05, False), ([0.52, 0.5], 0.01, False)]:
+        given = setup.replace(proposal=Given(answer=belief(mean, sd)))
+        after, info = update(jax.random.key(2), given, state, recordings)
+        assert bool(info.uninformed) == stays
+        assert _same(after.belief, known if stays else given.proposal.answer)

@@ -84,17 +84,20 @@ class Truncated:
 
     def mean(self) -> Float[Array, " d"]:
         """E θ of the truncated law, by 1024 quasi-random points for each component."""
-        middle = 0.5 * (self.box.low + self.box.high)
-        weights, theta = self._points()
-        return self.prior_share * middle + (1 - self.prior_share) * weights @ theta
+        return self.moments()[0]
 
     def covariance(self) -> Float[Array, "d d"]:
         """Cov θ of the truncated law, by the same points."""
-        mean, middle = self.mean(), 0.5 * (self.box.low + self.box.high)
+        return self.moments()[1]
+
+    def moments(self) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
+        """Mean and covariance of the truncated law, which are not those of the mixture where it leaves the box."""
+        middle = 0.5 * (self.box.low + self.box.high)
         weights, theta = self._points()
+        mean = self.prior_share * middle + (1 - self.prior_share) * weights @ theta
         cut = jnp.einsum("n,ni,nj->ij", weights, theta - mean, theta - mean)
         flat = jnp.diag(self.box.width**2 / 12) + jnp.outer(middle - mean, middle - mean)
-        return self.prior_share * flat + (1 - self.prior_share) * cut
+        return mean, self.prior_share * flat + (1 - self.prior_share) * cut
 
     def marginal_log_prob(self, axis: int, grid: Float[Array, " n"]) -> Float[Array, " n"]:
         """Log density of one axis of θ at the points of a grid, in raw units; −∞ outside the box.

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from bayessim_jax.beliefs import GaussianMixture, Truncated, Uniform, moment_match, quotient, reduce
+from bayessim_jax.beliefs import GaussianMixture, Truncated, Uniform, quotient, reduce
 from bayessim_jax.contracts import Belief, Box
 
 __all__ = ["PROPOSALS", "Corrected", "Paper", "ProposalMode", "TruncatedPrior", "lookup_proposal", "pool_weights"]
@@ -67,9 +67,9 @@ class Paper:
 class Corrected:
     """Simulate from one Gaussian, the belief's moments widened, and divide it out.
 
-    p̃ = N(m, c² S) on the prior's box, m and S the moments of the belief. The division is exact, component by component,
-    where a component of q is narrower than p̃ in every direction; one that is not stays as it is, which is the cautious
-    reading of recordings that said less than the proposal.
+    p̃ = N(m, c² S) on the prior's box, m and S the moments of the belief in the box. The division is exact, component by
+    component, where a component of q is narrower than p̃ in every direction; one that is not stays as it is, which is
+    the cautious reading of recordings that said less than the proposal.
 
     Source: Papamakarios and Murray 2016
     """
@@ -81,7 +81,8 @@ class Corrected:
 
     def propose(self, belief: Truncated) -> Truncated:
         """The widened Gaussian; the prior itself while the belief is the prior."""
-        mean, scale_tril = moment_match(belief.mixture)
+        mean, covariance = belief.moments()
+        scale_tril = jnp.linalg.cholesky(covariance)
         wide = GaussianMixture(jnp.zeros(1), mean[None], self.widening * scale_tril[None])
         return Truncated.create(wide, belief.box, belief.prior_share)
 
@@ -108,7 +109,8 @@ class TruncatedPrior:
 
     def propose(self, belief: Truncated) -> Uniform:
         """The prior on mean ± reach · sd."""
-        mean, sd = belief.mean(), jnp.sqrt(jnp.diagonal(belief.covariance()))
+        mean, covariance = belief.moments()
+        sd = jnp.sqrt(jnp.diagonal(covariance))
         low = jnp.maximum(belief.box.low, mean - self.reach * sd)
         high = jnp.minimum(belief.box.high, mean + self.reach * sd)
         return Uniform(Box(low, high, belief.box.names, belief.box.units))

@@ -79,6 +79,7 @@ def metrics_line(
         "nonfinite": int(info.fit.nonfinite) + int(np.sum(info.learning.nonfinite)),
         "overfit": bool(info.fit.overfit),
         "overconfident": bool(info.calibration.overconfident),
+        "uninformed": bool(info.uninformed),
         "collapsed": bool(info.collapsed),
         "pool_size": float(info.pool_size),
         "log_q_train": float(info.fit.log_q_train),

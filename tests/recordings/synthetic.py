@@ -76,6 +76,7 @@ def one_info(system, index, truth, steps=5, recordings=2, **flags):
         return_target=jnp.array(20.0 * index),
         diverged=jnp.array(0),
         pool_size=jnp.array(100.0),
+        uninformed=flag("uninformed"),
         collapsed=flag("collapsed"),
     )
 
