@@ -326,6 +326,6 @@ def _rows(leaf: Array) -> Array:
 
 def _compare(old: Truncated, new: Truncated) -> tuple[Scalar, Scalar]:
     """The log of the new volume over the old one, and the squared distance of the means in units of the new width."""
-    (old_mean, old_covariance), (new_mean, new_covariance) = old.moments(), new.moments()
-    log_ratio = 0.5 * (jnp.linalg.slogdet(new_covariance)[1] - jnp.linalg.slogdet(old_covariance)[1])
-    return log_ratio, (new_mean - old_mean) @ jnp.linalg.solve(new_covariance, new_mean - old_mean)
+    after, gap = new.covariance(), new.mean() - old.mean()
+    log_ratio = 0.5 * (jnp.linalg.slogdet(after)[1] - jnp.linalg.slogdet(old.covariance())[1])
+    return log_ratio, gap @ jnp.linalg.solve(after, gap)

@@ -17,7 +17,7 @@ from bayessim_jax.contracts import Box, Scalar
 __all__ = ["Truncated"]
 
 _CANDIDATES = 32
-_MOMENT_POINTS = 1024
+_POINTS = 1024
 
 
 @struct.dataclass
@@ -25,7 +25,8 @@ class Truncated:
     """p(θ) = s U(θ; box) + (1 − s) q(θ) 1[θ ∈ box] / ∫_box q, with q a Gaussian mixture and s the prior's share.
 
     With s = 1 it is the uniform prior: prior, proposal and posterior are one type and one scan carry. Make one with
-    `uniform` or `create`: the masses in the box are computed once, there.
+    `uniform` or `create`: what is integrated over the box is computed once, there, on 1024 quasi-random points for each
+    component.
     """
 
     mixture: GaussianMixture
@@ -33,24 +34,44 @@ class Truncated:
     prior_share: Scalar
     log_shares: Float[Array, " components"]
     """For each component the log of αₖ Zₖ, with Zₖ its mass in the box."""
+    center: Float[Array, " d"]
+    scatter: Float[Array, "d d"]
+    """Mean and covariance of p, which are not those of the mixture where it leaves the box."""
 
     @classmethod
     def uniform(cls, box: Box, components: int) -> Truncated:
         """The uniform prior on the box, in the shape of a posterior with that many components."""
         mixture = _idle(box, components)
         within = box.size * math.log(math.erf(math.sqrt(1.5)))  # of N(0, 1) on ±√3, axis by axis
-        return cls(mixture, box, jnp.ones((), box.low.dtype), jax.nn.log_softmax(mixture.log_weights) + within)
+        return cls(
+            mixture,
+            box,
+            jnp.ones((), box.low.dtype),
+            jax.nn.log_softmax(mixture.log_weights) + within,
+            0.5 * (box.low + box.high),
+            jnp.diag(box.width**2 / 12),
+        )
 
     @classmethod
     def create(cls, mixture: GaussianMixture, box: Box, prior_share: float | Scalar = 0.0) -> Truncated:
         """Cut a mixture to the box. One with no representable mass in it gives the prior, told by `prior_share` = 1."""
-        masses = box_probability(mixture.means, mixture.scale_trils, box.low, box.high)
-        log_shares = jax.nn.log_softmax(mixture.log_weights) + masses
-        whole = cls(mixture, box, jnp.asarray(prior_share, box.low.dtype), log_shares)
-        sound = jnp.isfinite(whole.log_mass())
+        u = lattice(_POINTS, box.size)
+        over = jax.vmap(jax.vmap(condition, (None, None, None, None, 0)), (0, 0, None, None, None))
+        log_each, fractions = over(mixture.means, mixture.scale_trils, box.low, box.high, u)
+        log_points = jax.nn.log_softmax(mixture.log_weights)[:, None] + log_each
+        log_shares = jax.nn.logsumexp(log_points, axis=1) - jnp.log(float(_POINTS))
+
+        share, safe = jnp.asarray(prior_share, box.low.dtype), cls.uniform(box, mixture.log_weights.size)
+        weights, theta = jax.nn.softmax(log_points.ravel()), box.low + fractions.reshape(-1, box.size) * box.width
+        center = share * safe.center + (1 - share) * weights @ theta
+        cut = jnp.einsum("n,ni,nj->ij", weights, theta - center, theta - center)
+        gap = safe.center - center
+        scatter = share * (safe.scatter + jnp.outer(gap, gap)) + (1 - share) * cut
+
+        sound = jnp.isfinite(jax.nn.logsumexp(log_shares))
         for leaf in jax.tree.leaves(mixture):
             sound &= ~jnp.isnan(leaf).any()
-        safe = cls.uniform(box, mixture.log_weights.size)
+        whole = cls(mixture, box, share, log_shares, center, scatter)
         return jax.tree.map(lambda a, b: jnp.where(sound, a, b), whole, safe)
 
     def log_mass(self) -> Scalar:
@@ -83,21 +104,12 @@ class Truncated:
         return jnp.where(self.box.contains(theta), self._blend(flat, cut), -jnp.inf)
 
     def mean(self) -> Float[Array, " d"]:
-        """E θ of the truncated law, by 1024 quasi-random points for each component."""
-        return self.moments()[0]
+        """E θ of the truncated law."""
+        return self.center
 
     def covariance(self) -> Float[Array, "d d"]:
-        """Cov θ of the truncated law, by the same points."""
-        return self.moments()[1]
-
-    def moments(self) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
-        """Mean and covariance of the truncated law, which are not those of the mixture where it leaves the box."""
-        middle = 0.5 * (self.box.low + self.box.high)
-        weights, theta = self._points()
-        mean = self.prior_share * middle + (1 - self.prior_share) * weights @ theta
-        cut = jnp.einsum("n,ni,nj->ij", weights, theta - mean, theta - mean)
-        flat = jnp.diag(self.box.width**2 / 12) + jnp.outer(middle - mean, middle - mean)
-        return mean, self.prior_share * flat + (1 - self.prior_share) * cut
+        """Cov θ of the truncated law."""
+        return self.scatter
 
     def marginal_log_prob(self, axis: int, grid: Float[Array, " n"]) -> Float[Array, " n"]:
         """Log density of one axis of θ at the points of a grid, in raw units; −∞ outside the box.
@@ -123,15 +135,6 @@ class Truncated:
 
     def _blend(self, flat: Scalar, cut: Float[Array, "..."]) -> Float[Array, "..."]:
         return jnp.logaddexp(_log(self.prior_share) + flat, _log(1 - self.prior_share) + cut)
-
-    def _points(self) -> tuple[Float[Array, " points"], Float[Array, "points d"]]:
-        """Weighted points of the mixture's part; the weights sum to one."""
-        u = lattice(_MOMENT_POINTS, self.box.size)
-
-        over = jax.vmap(jax.vmap(condition, (None, None, None, None, 0)), (0, 0, None, None, None))
-        log_weights, fractions = over(self.mixture.means, self.mixture.scale_trils, self.box.low, self.box.high, u)
-        weights = jax.nn.softmax((jax.nn.log_softmax(self.mixture.log_weights)[:, None] + log_weights).ravel())
-        return weights, self.box.low + fractions.reshape(-1, self.box.size) * self.box.width
 
 
 def _pick(u: Scalar, log_weights: Float[Array, " n"]) -> Int[Array, ""]:

@@ -81,9 +81,8 @@ class Corrected:
 
     def propose(self, belief: Truncated) -> Truncated:
         """The widened Gaussian; the prior itself while the belief is the prior."""
-        mean, covariance = belief.moments()
-        scale_tril = jnp.linalg.cholesky(covariance)
-        wide = GaussianMixture(jnp.zeros(1), mean[None], self.widening * scale_tril[None])
+        scale_tril = jnp.linalg.cholesky(belief.covariance())
+        wide = GaussianMixture(jnp.zeros(1), belief.mean()[None], self.widening * scale_tril[None])
         return Truncated.create(wide, belief.box, belief.prior_share)
 
     def combine(self, belief: Truncated, proposal: Truncated, q: GaussianMixture) -> Truncated:
@@ -109,8 +108,7 @@ class TruncatedPrior:
 
     def propose(self, belief: Truncated) -> Uniform:
         """The prior on mean ± reach · sd."""
-        mean, covariance = belief.moments()
-        sd = jnp.sqrt(jnp.diagonal(covariance))
+        mean, sd = belief.mean(), jnp.sqrt(jnp.diagonal(belief.covariance()))
         low = jnp.maximum(belief.box.low, mean - self.reach * sd)
         high = jnp.minimum(belief.box.high, mean + self.reach * sd)
         return Uniform(Box(low, high, belief.box.names, belief.box.units))
