@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -24,7 +24,7 @@ class Check:
     Exit status 0 where the case can be used, 2 where it cannot.
     """
 
-    case: tyro.conf.Positional[Path]
+    case: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="CASE")]]
     """The case: a folder with a case.toml."""
 
 

@@ -23,7 +23,7 @@ class New:
     Nothing that is there already is overwritten.
     """
 
-    case: tyro.conf.Positional[Path]
+    case: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="CASE")]]
     """Folder to make."""
     model: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """The robot's MJCF; it is copied into the folder with the files that it refers to."""

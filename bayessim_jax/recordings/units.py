@@ -44,7 +44,7 @@ def check_units(recording: CaseRecording, layout: Layout) -> list[Finding]:
     """Suspicions about the units of a recording's channels; nothing is changed."""
     found = _time(recording)
     for name, kind, q, v in layout.joints:
-        if kind not in (SLIDE, HINGE):
+        if kind not in (SLIDE, HINGE) or found:  # speeds say nothing while the time is in doubt
             continue
         suspicion = _ratio(recording, name, kind, q, v) or _range(recording, layout, name, kind, q)
         found += [suspicion] if suspicion else []

@@ -23,7 +23,7 @@ def read(path: Path, wanted: Collection[str] | None) -> Table:
     columns = {}
     name = ""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             if not isinstance(file, np.lib.npyio.NpzFile):
                 raise CaseError(path.name, "is a single array, not an NPZ file", "write it with numpy.savez")
             names = tuple(file.files)
