@@ -98,9 +98,7 @@ def find_target(path: str, model: Any) -> Target:
     """The target that a path names in a compiled model; raises `ValueError` with the near misses."""
     kind, _, rest = path.partition("/")
     if kind not in FIELDS:
-        every = [f"{k}/{n}" for k in FIELDS for n in element_names(model, k)]
-        similar = hint(kind, FIELDS) if kind.lower() in FIELDS or not rest else hint(path, _paths(model) + every)
-        raise ValueError(f"unknown path {quote(path)}; {similar}")
+        raise ValueError(f"unknown path {quote(path)}; {hint(path, _paths(model)) if path else hint('', FIELDS)}")
     names = element_names(model, kind)
     if kind == "option":
         name, tail = "", rest
