@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bayessim_jax.recordings.checks import check_columns, check_missing, check_time, gap_limit, gaps
-from bayessim_jax.recordings.readers import read_table
+from bayessim_jax.recordings.readers import Table, read_table
 from bayessim_jax.recordings.recording import CaseRecording
 from bayessim_jax.recordings.units import check_units
 from bayessim_jax.recordings.velocity import estimate_slopes
@@ -49,7 +49,7 @@ def read_recording(
     if errors := check_time(file, time):
         return None, found + errors
     for name, values in data.items():
-        found += check_missing(file, name, values, table.asynchronous, name not in layout.qvel)
+        found += check_missing(file, name, values, name not in layout.qvel, _remedy(name, values, table, layout))
     if any(f.severity == "error" for f in found):
         return None, found
     recording, more = _assemble(file, time, data, layout, table.asynchronous)
@@ -58,6 +58,17 @@ def read_recording(
         what = "holds no two rows without a gap and with known commands"
         return None, [*found, Finding("error", file, what, "record again or remove it")]
     return recording, found + check_units(recording, layout)
+
+
+def _remedy(name: str, values: np.ndarray, table: Table, layout: Layout) -> str:
+    """What to do about numbers that are missing; nothing where they were not due."""
+    if table.asynchronous:
+        return ""
+    if name not in layout.ctrl:
+        return "it is masked there; fill it in where you know it"
+    if np.isfinite(values).mean() < 1 - SPARSE:
+        return "it is held where it is missing; fill it in where it changed"
+    return "no window is compared there; fill in what was commanded"
 
 
 def _assemble(
@@ -104,18 +115,14 @@ def _held(
     given = np.isfinite(values)
     if given.all():
         return values, ~given, []
-    share = 1 - given.mean()
     last = np.maximum.accumulate(np.where(given, np.arange(len(time)), -1))
     held = np.where(last >= 0, values[np.maximum(last, 0)], 0.0)
-    if not asynchronous and share <= SPARSE:
+    if not asynchronous and given.mean() >= 1 - SPARSE:
         return held, ~given, []
     unknown = last < 0
     if not asynchronous:
         unknown |= time - time[np.maximum(last, 0)] > gap_limit(time[given])
-    what = f"{name} is given in {given.sum()} of {len(time)} rows"
-    found = (
-        [] if asynchronous else [Finding("warning", file, what, "it is held in between; fill it in where it changed")]
-    )
+    found = []
     if unknown.any():
         row = int(np.flatnonzero(unknown)[0]) + 1
         what = f"{name} is not known in {unknown.sum()} rows, first here"

@@ -86,20 +86,24 @@ def check_time(file: str, time: Float[np.ndarray, " rows"]) -> list[Finding]:
 
 
 def check_missing(
-    file: str, channel: str, values: Float[np.ndarray, " rows"], asynchronous: bool, needed: bool = True
+    file: str,
+    channel: str,
+    values: Float[np.ndarray, " rows"],
+    needed: bool = True,
+    remedy: str = "it is masked there; fill it in where you know it",
 ) -> list[Finding]:
-    """NaN and infinite numbers in a measured channel: masked where there are some, an error where nothing is left."""
+    """NaN and infinite numbers in a channel: a warning where there are some, an error where nothing is left."""
     bad = ~np.isfinite(values)
     count, rows = int(bad.sum()), len(values)
     if count == rows:
         severity = "error" if needed else "warning"
         return [Finding(severity, file, f"{channel} holds no number", "record it, or remove the column")]
-    if not count or asynchronous:
+    if not count or not remedy:
         return []
     row = int(np.flatnonzero(bad)[0])
     word = "is empty or NaN" if np.isnan(values[bad]).all() else "is not finite"
     what = f"{channel} {word} in {count} of {rows} rows, first here" if count > 1 else f"{channel} {word}"
-    return [Finding("warning", file, what, "it is masked there; fill it in where you know it", row + 1)]
+    return [Finding("warning", file, what, remedy, row + 1)]
 
 
 def gap_limit(time: Float[np.ndarray, " rows"]) -> float:

@@ -76,18 +76,20 @@ def local_quadratic(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Slope, sum of squared residuals and number of rows of the fits around rows `start` to `stop`.
 
+    At the ends of a run the fit is that of the nearest row that has `half` rows to each side.
     Times are taken from the row itself and in units of the mean step, values from the row's own, so that epoch times
     lose no digits.
     """
-    rows = len(time)
     here = np.arange(start, stop)
+    first, last = np.searchsorted(run, run[here], "left"), np.searchsorted(run, run[here], "right") - 1
+    centre = np.where(last - first > 2 * half, np.clip(here, first + half, last - half), (first + last) // 2)
     unit = max((time[stop - 1] - time[start]) / max(stop - start - 1, 1), 1e-12)
     s = np.zeros((5, stop - start))
     b = np.zeros((3, stop - start))
     squares = np.zeros(stop - start)
     for offset in range(-half, half + 1):
-        other = np.clip(here + offset, 0, rows - 1)
-        weight = ((run[other] == run[here]) & (other == here + offset)).astype(float)
+        other = np.clip(centre + offset, first, last)
+        weight = (other == centre + offset).astype(float)
         dt = (time[other] - time[here]) / unit * weight
         dy = (values[other] - values[here]) * weight
         power = weight
@@ -101,7 +103,7 @@ def local_quadratic(
     m00, m01, m02 = s[2] * s[4] - s[3] ** 2, s[1] * s[4] - s[2] * s[3], s[1] * s[3] - s[2] ** 2
     m11, m12, m22 = s[0] * s[4] - s[2] ** 2, s[0] * s[3] - s[1] * s[2], s[0] * s[2] - s[1] ** 2
     det = s[0] * m00 - s[1] * m01 + s[2] * m02
-    curved = (s[0] >= 4) & (det > 0)
+    curved = (s[0] >= 3) & (det > 1e-9 * s[0] * s[2] * s[4])
     straight = (s[0] >= 2) & (m22 > 0)
     det = np.where(curved, det, 1.0)
     c0 = (m00 * b[0] - m01 * b[1] + m02 * b[2]) / det

@@ -26,7 +26,10 @@ def test_a_good_case_is_described(tmp_path, capsys):
     assert told.err == ""
     assert "model.xml with 1 joint, 1 actuator, 1 sensor value" in told.out
     assert "bob_mass = body/bob/mass: uniform, 0.15 to 0.6 kg; 0.3 in the model" in told.out
-    assert "run1.csv: 400 rows, 3.99 s at 100 Hz; qpos 1/1, qvel 1/1, sensors 0/1, ctrl 1/1 measured; 7 windows" in told.out
+    assert (
+        "run1.csv: 400 rows, 3.99 s at 100 Hz; qpos 1/1, qvel 1/1, sensors 0/1, ctrl 1/1 measured; 7 windows"
+        in told.out
+    )
     assert told.out.endswith("ok          the case can be used\n")
 
 
@@ -147,7 +150,10 @@ BROKEN = {
         ["unknown path 'joints/hinge/damping'", "did you mean 'joint/hinge/damping'"],
     ),
     "missing index": ({"case": toml(TARGET, '"body/bob/ipos"')}, ["ipos needs an index, ipos/0 to ipos/2"]),
-    "index too large": ({"case": toml(TARGET, '"option/gravity/3"')}, ["gravity needs an index, gravity/0 to gravity/2"]),
+    "index too large": (
+        {"case": toml(TARGET, '"option/gravity/3"')},
+        ["gravity needs an index, gravity/0 to gravity/2"],
+    ),
     "prior outside the physical range": (
         {"case": toml("low = 0.15", "low = -0.15")},
         ["parameter bob_mass: the prior reaches down to -0.15", "body/bob/mass has to be above 0", "raise 'low'"],
@@ -223,7 +229,10 @@ BROKEN = {
         ["model.xml: does not compile", "mass and inertia of moving bodies", "line"],
     ),
     "model that is not XML": ({"model": xml("</mujoco>", "")}, ["model.xml: is not XML"]),
-    "model that is not MJCF": ({"model": "<robot name='r'/>"}, ["model.xml: is not MJCF, its outermost element is <robot>"]),
+    "model that is not MJCF": (
+        {"model": "<robot name='r'/>"},
+        ["model.xml: is not MJCF, its outermost element is <robot>"],
+    ),
     "include outside": (
         {"model": xml("<worldbody>", '<include file="../secret.xml"/><worldbody>')},
         ["model.xml: <include> refers to '../secret.xml', outside of the case folder"],

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 from array import array
 from typing import TYPE_CHECKING, Any
@@ -29,49 +31,53 @@ def read(path: Path, wanted: Collection[str] | None) -> Table:
     `column` in case.toml to refer to. A message's time is its header's stamp, a number under `time`, or when it was
     logged. Rows stand at every time of a column that is wanted; what was not measured then is NaN.
     """
-    from mcap.exceptions import McapError
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
-
     series: dict[str, tuple[array, array]] = {}
     names: dict[str, None] = {}
     unread: dict[str, None] = {}
-    cdr = DecoderFactory()
     try:
-        with path.open("rb") as stream:
-            for schema, channel, message in make_reader(stream).iter_messages():
-                if channel.message_encoding == "json":
-                    content = json.loads(message.data)
-                elif decode := cdr.decoder_for(channel.message_encoding, schema):
-                    content = decode(message.data)
-                else:
-                    unread[f"{channel.topic} ({channel.message_encoding})"] = None
-                    continue
-                time = _time(content, message.log_time)
-                for name, value in _columns(content, channel.topic):
-                    names[name] = None
-                    if wanted is None or name in wanted:
-                        times, values = series.setdefault(name, (array("d"), array("d")))
-                        if times and not time > times[-1]:
-                            what = "occurs twice" if time == times[-1] else "runs backwards"
-                            where = f"in message {len(times) + 1} of {quote(channel.topic)}, at {time:.9g} s"
-                            raise CaseError(
-                                path.name, f"time {what} {where}", "keep one message for each time, in order"
-                            )
-                        times.append(time)
-                        values.append(value)
-    except CaseError:
+        for topic, logged, content, encoding in _messages(path):
+            if content is None:
+                unread[f"{topic} ({encoding})"] = None
+                continue
+            time = _time(content, logged)
+            for name, value in _columns(content, topic):
+                names[name] = None
+                if wanted is None or name in wanted:
+                    times, values = series.setdefault(name, (array("d"), array("d")))
+                    if times and not time > times[-1]:
+                        what = "occurs twice" if time == times[-1] else "runs backwards"
+                        where = f"in message {len(times) + 1} of {quote(topic)}, at {time:.9g} s"
+                        raise CaseError(path.name, f"time {what} {where}", "keep one message for each time, in order")
+                    times.append(time)
+                    values.append(value)
+    except (CaseError, OSError, ImportError):
         raise
-    except (McapError, ValueError, KeyError, IndexError, TypeError, EOFError, RecursionError) as error:
-        raise CaseError(path.name, f"is damaged or not MCAP ({reason(error)})", "record or convert it again") from error
-    except Exception as error:  # the decompressors and the decoder raise errors of their own
-        if type(error).__module__.split(".")[0] not in ("struct", "lz4", "zstandard", "mcap", "mcap_ros2", "builtins"):
-            raise
+    except Exception as error:  # decompressors and decoders have errors of their own kinds
         raise CaseError(path.name, f"is damaged or not MCAP ({reason(error)})", "record or convert it again") from error
     if unread and not series:
         known = ", ".join(quote(name) for name in list(unread)[:3])
         raise CaseError(path.name, f"no message is JSON or ROS 2 CDR, only {known}", "convert the recording")
     return _merge(("time", *names, *unread), series)
+
+
+def _messages(path: Path) -> Iterator[tuple[str, int, Any, str]]:
+    """Topic, time of logging in ns, content (None where it cannot be decoded) and encoding of every message."""
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    factory, decoders = DecoderFactory(), {}
+    with path.open("rb") as stream:
+        for schema, channel, message in make_reader(stream).iter_messages():
+            content = None
+            if channel.message_encoding == "json":
+                content = json.loads(message.data)
+            else:
+                if channel.id not in decoders:
+                    with contextlib.redirect_stderr(io.StringIO()):  # the parser of definitions prints what it refuses
+                        decoders[channel.id] = factory.decoder_for(channel.message_encoding, schema)
+                if decode := decoders[channel.id]:
+                    content = decode(message.data)
+            yield channel.topic, message.log_time, content, channel.message_encoding
 
 
 def _merge(names: tuple[str, ...], series: dict[str, tuple[array, array]]) -> Table:

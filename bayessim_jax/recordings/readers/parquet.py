@@ -34,6 +34,8 @@ def read(path: Path, wanted: Collection[str] | None) -> Table:
             for batch in file.iter_batches(columns=chosen):
                 for name, column in zip(batch.schema.names, batch.columns, strict=True):
                     parts[name].append(column.cast(pa.float64()).to_numpy(zero_copy_only=False))
-    except pa.ArrowException as error:
+    except CaseError:
+        raise
+    except (pa.ArrowException, ValueError) as error:
         raise CaseError(path.name, f"is damaged or not Parquet ({reason(error)})", "write it again") from error
     return Table(names, {name: np.concatenate(parts.pop(name) or [np.empty(0)]) for name in chosen})
