@@ -57,9 +57,9 @@ def test_every_candidate_is_a_parameter_that_the_model_has(tmp_path):
     main(["new", str(tmp_path / "case"), "--model", str(write_arm(tmp_path / "robot"))])
     path = tmp_path / "case" / "case.toml"
     text = path.read_text()
-    head, *parameters = text.split("\n\n")
-    lines = [line.removeprefix("# ") for line in "\n".join(parameters[1:]).splitlines()]
-    path.write_text("\n".join([head, *lines]) + "\n")
+    start = text.index("[[parameters]]")
+    lines = [line.removeprefix("# ") for line in text[start:].splitlines()]
+    path.write_text(text[:start] + "\n".join(lines) + "\n")
     names = [table["name"] for table in tomllib.loads(path.read_text())["parameters"]]
     some = {"slider_mass", "p2nd_joint_damping", "rail_armature", "servo_gain", "motor_gear", "tip_friction"}
     assert some < set(names)
