@@ -9,8 +9,8 @@ import numpy as np
 from bayessim_jax.recordings.checks import check_columns, check_missing, check_time, gap_limit, gaps
 from bayessim_jax.recordings.readers import Table, read_table
 from bayessim_jax.recordings.recording import CaseRecording
+from bayessim_jax.recordings.states import fill_in, joint_velocities
 from bayessim_jax.recordings.units import check_units
-from bayessim_jax.recordings.velocity import estimate_slopes
 from bayessim_jax.recordings.wording import CaseError, Finding
 
 if TYPE_CHECKING:
@@ -30,6 +30,13 @@ def read_recording(
     path: Path, layout: Layout, channels: Mapping[str, ChannelSpec]
 ) -> tuple[CaseRecording | None, list[Finding]]:
     """Read one file into the simulator's arrays; without a recording where an error was found. Never raises for it."""
+    with np.errstate(all="ignore"):  # absurd numbers overflow in what is computed of them only
+        return _read(path, layout, channels)
+
+
+def _read(
+    path: Path, layout: Layout, channels: Mapping[str, ChannelSpec]
+) -> tuple[CaseRecording | None, list[Finding]]:
     file = path.name
     columns = {name: channels[name].column if name in channels else name for name in ("time", *layout.channels)}
     try:
@@ -92,17 +99,18 @@ def _assemble(
         qpos_measured[:, i] = np.isfinite(values)
         if asynchronous:
             found += gaps(file, time[qpos_measured[:, i]], name)[1]
-        qpos[:, i], near = _filled(time, values)
+        qpos[:, i], near = fill_in(time, values)
         known &= near
     found += _normalized(file, qpos, layout)
-    qvel, qvel_measured, half_widths = _velocities(time, qpos, qpos_measured, data, layout, wide)
+    qvel, qvel_measured, half_widths = joint_velocities(time, qpos, qpos_measured, data, layout, wide)
     known &= np.isfinite(qvel).all(1)
     sensors, seen = np.zeros((len(time), len(layout.sensors))), np.zeros((len(time), len(layout.sensors)), bool)
     for i, name in enumerate(layout.sensors):
         values = data.pop(name, None)
         if values is not None and np.isfinite(values).any():
             seen[:, i] = np.isfinite(values)
-            sensors[:, i], near = _filled(time, values)
+            found += gaps(file, time[seen[:, i]], name)[1] if asynchronous else []
+            sensors[:, i], near = fill_in(time, values)
             known &= near | bool(layout.qpos)
     parts = (time, ctrl, qpos, np.nan_to_num(qvel), sensors, qpos_measured, qvel_measured, seen, valid, known)
     return CaseRecording(file, *parts, half_widths=half_widths), found
@@ -144,21 +152,6 @@ def _unwrapped(file: str, name: str, values: np.ndarray) -> tuple[np.ndarray, li
     return out, [Finding("warning", file, what, "it is made continuous; log it without wrapping", row)]
 
 
-def _filled(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values on a line between those measured, and which rows lie on or between measurements close by."""
-    rows = np.flatnonzero(np.isfinite(values))
-    if len(rows) == len(time):
-        return values, np.ones(len(time), bool)
-    close = np.diff(time[rows]) <= max(gap_limit(time[rows]), 0.0)
-    after = np.searchsorted(rows, np.arange(len(time)), side="left")
-    between = (after > 0) & (after < len(rows))
-    near = np.zeros(len(time), bool)
-    if len(rows) > 1:
-        near = between & close[np.clip(after - 1, 0, len(close) - 1)]
-    near[rows] = True
-    return np.interp(time, time[rows], values[rows]), near
-
-
 def _normalized(file: str, qpos: np.ndarray, layout: Layout) -> list[Finding]:
     """Unit quaternions without jumps between q and −q, which turn alike, in place; a warning for other lengths."""
     found = []
@@ -172,62 +165,3 @@ def _normalized(file: str, qpos: np.ndarray, layout: Layout) -> list[Finding]:
         sign = np.where(np.cumsum(flips) % 2, -1.0, 1.0)
         qpos[:, q : q + 4] *= (sign / np.maximum(norm, 1e-9))[:, None]
     return found
-
-
-def _velocities(
-    time: np.ndarray,
-    qpos: np.ndarray,
-    measured: np.ndarray,
-    data: dict[str, np.ndarray],
-    layout: Layout,
-    wide: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
-    """Velocities as measured, or from the positions; NaN where there is neither."""
-    qvel, seen = np.full((len(time), len(layout.qvel)), np.nan), np.zeros((len(time), len(layout.qvel)), bool)
-    halves = [0] * len(layout.qvel)
-    given = {name: data.pop(name) for name in layout.qvel if name in data}
-    turning = {v + k: (q, k) for q, v in layout.quaternions for k in range(3)}
-    place = {}
-    for _, kind, q, v in layout.joints:
-        place |= {v + k: q + k for k in range({0: 3, 1: 0}.get(kind, 1))}
-    rates: dict[int, np.ndarray] = {}
-    for i, name in enumerate(layout.qvel):
-        values = given.get(name)
-        if values is not None and np.isfinite(values).any():
-            qvel[:, i], near = _filled(time, values)
-            seen[:, i] = np.isfinite(values)
-            qvel[~near, i] = np.nan
-        elif i in turning:
-            q, k = turning[i]
-            if q not in rates:
-                rates[q], halves[i] = _angular(
-                    time, qpos[:, q : q + 4], np.asarray(measured[:, q : q + 4].all(1)), wide
-                )
-            qvel[:, i], halves[i] = rates[q][:, k], max(halves[i], 1)
-        else:
-            qvel[:, i], halves[i] = _slopes(time, qpos[:, place[i]], measured[:, place[i]], wide)
-    return qvel, seen, tuple(halves)
-
-
-def _slopes(time: np.ndarray, values: np.ndarray, measured: np.ndarray, wide: np.ndarray) -> tuple[np.ndarray, int]:
-    """Slopes at every row from the rows that were measured."""
-    rows = np.flatnonzero(measured)
-    if len(rows) < 2:
-        return np.full(len(time), np.nan), 1
-    own = time[rows]
-    broken = np.concatenate([[0], np.cumsum(wide)])[rows]
-    slopes, half = estimate_slopes(own, values[rows], (np.diff(broken) > 0) | (np.diff(own) > gap_limit(own)))
-    out = np.full(len(time), np.nan)
-    out[rows] = slopes
-    filled, near = _filled(time, out) if np.isfinite(out).any() else (out, np.zeros(len(time), bool))
-    return np.where(near, filled, np.nan), half
-
-
-def _angular(
-    time: np.ndarray, quaternion: np.ndarray, measured: np.ndarray, wide: np.ndarray
-) -> tuple[np.ndarray, int]:
-    """Angular velocity in the body's frame, ω = 2 vec(q̄ ⊗ dq/dt), of a unit quaternion w, x, y, z."""
-    slopes = [_slopes(time, quaternion[:, k], measured, wide) for k in range(4)]
-    (w, x, y, z), (dw, dx, dy, dz) = quaternion.T, (s for s, _ in slopes)
-    turn = (w * dx - x * dw - y * dz + z * dy, w * dy - y * dw - z * dx + x * dz, w * dz - z * dw - x * dy + y * dx)
-    return 2 * np.stack(turn, 1), max(half for _, half in slopes)

@@ -23,7 +23,7 @@ KEYS = ("schema", "name", "model", "system", "recordings", "horizon", "parameter
 PARAMETER_KEYS = ("name", "unit", "targets", "prior")
 CHANNEL_KEYS = ("column", "scale", "offset")
 HORIZON = 0.5
-NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+NAME = re.compile(r"[^\W\d][\w .-]*")
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,12 @@ class Case:
 
     @property
     def files(self) -> list[Path]:
-        """The recordings, sorted by name; raises `CaseError` where there is none."""
-        found = sorted(path for path in self.folder.glob(self.recordings) if path.is_file())
+        """The recordings, sorted by name, without hidden files; raises `CaseError` where there is none."""
+        try:
+            found = sorted(p for p in self.folder.glob(self.recordings) if p.is_file() and not p.name.startswith("."))
+        except (ValueError, NotImplementedError) as error:
+            what = f"recordings = {quote(self.recordings)} is no pattern ({error})"
+            raise CaseError(FILE, what, "correct it, such as recordings/*.csv") from error
         if not found:
             near = f"files end in {', '.join(SUFFIXES)}"
             raise CaseError(
@@ -84,7 +88,7 @@ def read_case(folder: Path) -> Case:
         raise CaseError(FILE, what, "check the folder, or make a case with: bayessim new") from error
     except UnicodeDecodeError as error:
         raise CaseError(FILE, "is not UTF-8 text", "save it in UTF-8") from error
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise CaseError(FILE, f"is not TOML ({error})", "correct it there") from error
     try:
         return _case(path.parent, tables)
@@ -136,7 +140,7 @@ def _parameters(tables: list[Any]) -> tuple[ParameterSpec, ...]:
         _known(_table(table, where), PARAMETER_KEYS, f"{where}: ")
         name = _text(table, "name", f"{where}: ")
         if not NAME.fullmatch(name):
-            raise ValueError(f"{where}: name {quote(name)} is not of letters, digits and _; rename it")
+            raise ValueError(f"{where}: name {quote(name)} has to be of letters, digits, _, - and .; rename it")
         where = f"parameter {name}"
         if name in (spec.name for spec in found):
             raise ValueError(f"{where} occurs twice; rename one, or give one both targets")

@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 from bayessim_jax.recordings.wording import CaseError, quote
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 __all__ = ["compile_spec", "import_mujoco", "read_spec", "referenced_files"]
@@ -44,35 +45,63 @@ def compile_spec(spec: Any, path: Path) -> Any:
 def referenced_files(path: Path, root: Path) -> list[Path]:
     """Every file that an MJCF file includes or loads, itself first; raises `CaseError` for one outside `root`.
 
-    A reference is looked for beside the main file, beside the file that makes it and in the folder that the compiler
-    names for its kind; each of these places has to be inside.
+    A reference is taken from beside the main file and from beside the file that makes it, in the folder that the
+    compiler names for its kind; both have to be inside. Files that are not there are left to MuJoCo to miss.
     """
-    root, found, waiting = root.resolve(), [], [path]
-    folders: dict[str, str] = {}
+    found: dict[Path, Path] = {}
+    models = [path]
+    while models:
+        parts = _parts(models[0], root)
+        for place in _loaded(models.pop(0), parts, root):
+            nested = place.suffix.lower() in (".xml", ".mjcf")
+            if place.resolve() not in found and nested:
+                models.append(place)
+            found.setdefault(place.resolve(), place)
+        found = {file.resolve(): file for file in parts} | found
+    return list(found.values())
+
+
+def _parts(path: Path, root: Path) -> dict[Path, ElementTree.Element]:
+    """A model file and everything that it includes, parsed."""
+    found, seen, waiting = {}, set(), [path]
     while waiting:
-        current = waiting.pop(0)
-        found.append(current)
-        tree = _parse(current)
-        for compiler in tree.iter("compiler"):
-            shared = {key: compiler.attrib["assetdir"] for key in FOLDERS.values() if "assetdir" in compiler.attrib}
-            folders |= shared | {key: compiler.attrib[key] for key in FOLDERS.values() if key in compiler.attrib}
-        for element in tree.iter():
-            for name, value in element.attrib.items():
-                if not (name.startswith("file") and value):
-                    continue
-                folder = folders.get(FOLDERS.get(element.tag, ""), "")
-                places = [base / folder / value for base in (path.parent, current.parent)]
-                places.append(path.parent / value)
-                for place in places:
-                    if not place.resolve().is_relative_to(root):
-                        what = f"<{element.tag}> refers to {quote(value)}, outside of the case folder"
-                        raise CaseError(current.name, what, "copy the file into the folder and refer to it there")
-                there = next((place for place in places if place.is_file()), None)
-                if there is None or there in found or there in waiting:
-                    continue
-                nested = element.tag in ("include", "model") and there.suffix.lower() in (".xml", ".mjcf")
-                (waiting if nested else found).append(there)
+        file = waiting.pop(0)
+        if file.resolve() in seen:
+            continue
+        seen.add(file.resolve())
+        found[file] = _parse(file)
+        for element in found[file].iter("include"):
+            places = _places(element, element.attrib.get("file", ""), "", (path, file), root)
+            waiting += [place for place in places if place.is_file()][:1]
     return found
+
+
+def _loaded(path: Path, parts: dict[Path, ElementTree.Element], root: Path) -> Iterator[Path]:
+    """What a model loads besides its parts: meshes, textures, other models."""
+    folders: dict[str, str] = {}
+    for file, tree in parts.items():
+        for compiler in tree.iter("compiler"):
+            shared = dict.fromkeys(FOLDERS.values(), compiler.attrib.get("assetdir"))
+            given = shared | {key: compiler.attrib[key] for key in FOLDERS.values() if key in compiler.attrib}
+            folders |= {key: value for key, value in given.items() if value}
+            for value in folders.values():
+                _places(compiler, value, "", (path, file), root)
+    for file, tree in parts.items():
+        for element in tree.iter():
+            folder = folders.get(FOLDERS.get(element.tag, ""), "")
+            for name, value in element.attrib.items():
+                if name.startswith("file") and value and element.tag != "include":
+                    yield from [p for p in _places(element, value, folder, (path, file), root) if p.is_file()][:1]
+
+
+def _places(element: ElementTree.Element, value: str, folder: str, files: tuple[Path, Path], root: Path) -> list[Path]:
+    """Where a reference of a file may point, beside the main file and beside itself; raises `CaseError` outside."""
+    places = [file.parent / folder / value for file in files]
+    for place in places:
+        if not place.resolve().is_relative_to(root.resolve()):
+            what = f"<{element.tag}> refers to {quote(value)}, outside of the case folder"
+            raise CaseError(files[1].name, what, "copy the file into the folder and refer to it there")
+    return places
 
 
 def _parse(path: Path) -> ElementTree.Element:

@@ -243,7 +243,7 @@ BROKEN = {
     ),
     "mesh folder outside": (
         {"model": xml("<worldbody>", '<compiler meshdir=".."/><asset><mesh file="m.stl"/></asset><worldbody>')},
-        ["<mesh> refers to 'm.stl', outside"],
+        ["<compiler> refers to '..', outside"],
     ),
     "joint without a name": (
         {"model": MODEL.replace('name="hinge" type', "type").split("<actuator>")[0] + "</mujoco>"},
@@ -365,6 +365,13 @@ def nested_include(folder):
     (folder / "model.xml").write_text(xml("<worldbody>", '<include file="part.xml"/><worldbody>'))
 
 
+def folder_from_an_include(folder):
+    (folder / "part.xml").write_text('<mujocoinclude><compiler assetdir="/tmp"/></mujocoinclude>')
+    (folder / "model.xml").write_text(
+        xml("<worldbody>", '<asset><mesh file="m.stl"/></asset><include file="part.xml"/><worldbody>')
+    )
+
+
 @pytest.mark.parametrize(
     ("spoil", "fragments"),
     [
@@ -382,6 +389,7 @@ def nested_include(folder):
         (unknown_format, ["run1.bag: unknown format '.bag'"]),
         (no_folder, ["case.toml: cannot be read in", "No such file"]),
         (linked_mesh, ["model.xml: <include> refers to 'inside.xml', outside"]),
+        (folder_from_an_include, ["part.xml: <compiler> refers to '/tmp', outside"]),
         (nested_include, ["part.xml: <include> refers to '../other.xml', outside"]),
     ],
     ids=lambda x: getattr(x, "__name__", ""),

@@ -7,6 +7,7 @@ import pytest
 
 from bayessim_jax.cli.main import main
 from bayessim_jax.recordings.loading import load_case
+from bayessim_jax.recordings.mjcf import referenced_files
 from tests.recordings.made_up_case import MODEL, columns, csv_text
 
 ARM = """
@@ -83,6 +84,27 @@ def test_what_the_model_refers_to_comes_along(tmp_path):
     assert main(["new", str(tmp_path / "case"), "--model", str(write_arm(tmp_path / "robot"))]) == 0
     assert (tmp_path / "case" / "assets" / "tetra.obj").read_text() == TETRA
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "case" / "arm.xml")).nmesh == 1
+
+
+def test_folders_and_other_models_come_along_once(tmp_path):
+    text = ARM.replace('meshdir="assets"', 'meshdir="assets/deep"').replace("tetra.obj", "../tetra.obj")
+    text = text.replace("<worldbody>", '<include file="part.xml"/><worldbody>', 1)
+    text = text.replace("<asset>", '<asset><model name="hand" file="hand.xml"/>')
+    model = write_arm(tmp_path / "robot", text)
+    (tmp_path / "robot" / "assets" / "deep").mkdir()
+    (tmp_path / "robot" / "part.xml").write_text('<mujocoinclude><option gravity="0 0 -1"/></mujocoinclude>')
+    hand = '<mujoco model="hand"><asset><mesh name="t" file="assets/tetra.obj"/></asset></mujoco>'
+    (tmp_path / "robot" / "hand.xml").write_text(hand)
+    files = referenced_files(model, tmp_path / "robot")
+    assert len(files) == len({file.resolve() for file in files})
+    assert {file.name for file in files} == {"arm.xml", "part.xml", "hand.xml", "tetra.obj"}
+
+
+def test_models_that_refer_to_one_another_are_read_once(tmp_path):
+    (tmp_path / "d" / "e").mkdir(parents=True)
+    (tmp_path / "a.xml").write_text('<mujoco><include file="d/x.xml"/><asset><model file="a.xml"/></asset></mujoco>')
+    (tmp_path / "d" / "x.xml").write_text('<mujocoinclude><include file="e/../x.xml"/></mujocoinclude>')
+    assert {file.name for file in referenced_files(tmp_path / "a.xml", tmp_path)} == {"a.xml", "x.xml"}
 
 
 def test_a_model_in_the_folder_stays_where_it_is(tmp_path):
