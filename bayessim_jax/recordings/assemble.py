@@ -142,8 +142,10 @@ def _unwrapped(file: str, name: str, values: np.ndarray) -> tuple[np.ndarray, li
     """An angle whose sensor starts again after a turn, made continuous."""
     rows = np.flatnonzero(np.isfinite(values))
     jumps = np.diff(values[rows])
-    turns = np.where(np.abs(np.abs(jumps) / (2 * np.pi) - 1) < 0.1, np.sign(jumps), 0.0)
-    if not turns.any():
+    sizes = np.pad(np.abs(jumps), 1)
+    lonely = sizes[1:-1] > 3 * np.maximum(sizes[:-2], sizes[2:])  # a fast joint in another unit jumps again and again
+    turns = np.where(lonely & (np.abs(np.abs(jumps) / (2 * np.pi) - 1) < 0.1), np.sign(jumps), 0.0)
+    if not turns.any() or np.ptp(values[rows]) > 2.02 * np.pi:
         return values, []
     out = values.copy()
     out[rows[1:]] -= 2 * np.pi * np.cumsum(turns)

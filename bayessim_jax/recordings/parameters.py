@@ -102,4 +102,4 @@ def _believable(spec: ParameterSpec, prior: Prior, value: float | None) -> list[
     if value is None or prior.low <= value <= prior.high:
         return []
     what = f"parameter {spec.name}: the model's own value {value:g} lies outside of the prior ({prior})"
-    return [Finding("suspicion", FILE, what, "check the prior's unit and the model")]
+    return [Finding("suspicion", FILE, what, f"check the unit of the prior of {spec.name} and the model")]

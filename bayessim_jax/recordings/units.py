@@ -107,7 +107,7 @@ def _range(recording: CaseRecording, layout: Layout, name: str, kind: int, q: in
     reaches = max(abs(values.min()), abs(values.max()))
     if reaches > 3 * max(abs(low), abs(high)) and reaches < 1.2 * factor * max(abs(low), abs(high)):
         return _suspect(recording.name, f"{what}: it looks like {other}", channel, f"scale = {scale}")
-    return Finding("suspicion", recording.name, what, "correct the model's range, or the column's zero and unit")
+    return Finding("suspicion", recording.name, what, f"correct the model's range, or zero and unit of {channel}")
 
 
 def _travel(file: str, channel: str, kind: int, values: np.ndarray) -> Finding | None:
@@ -130,7 +130,12 @@ def _commands(recording: CaseRecording, layout: Layout) -> list[Finding]:
         if not np.isnan(low) and max(low - values.min(), values.max() - high) > 0.01 * (high - low):
             what = f"{channel} goes from {values.min():.4g} to {values.max():.4g}, its ctrlrange is {low:g} to {high:g}"
             found.append(
-                Finding("suspicion", recording.name, what, "the simulator clips it; check its unit and the model")
+                Finding(
+                    "suspicion",
+                    recording.name,
+                    what,
+                    f"the simulator clips it; check the unit of {channel} and the model",
+                )
             )
     return found
 

@@ -46,12 +46,14 @@ class Windows:
 def find_windows(recording: CaseRecording, horizon: float, stride: float | None = None) -> list[Span]:
     """First and last row of every window of `horizon` seconds in a recording.
 
-    The next window starts where the last one ended, or `stride` seconds after its start. Rows that jitter count: a
-    window ends at the row nearest to its nominal end, and is not made where that misses it by more than half a step.
+    The next window starts where the last one ended, or `stride` seconds after its start. A window ends at the row
+    nearest to its nominal end; where rows lie so far apart that it would be half as long again, it is not made.
     """
     found, time = [], recording.time
     starts = np.append(np.flatnonzero(recording.known), len(time))
     for first, last in recording.spans:
+        if last - first < 2 or np.median(np.diff(time[first : last + 1])) > horizon:
+            continue
         slack = float(np.median(np.diff(time[first : last + 1]))) / 2 * (1 + 1e-6)
         row = int(starts[np.searchsorted(starts, first)])
         while row < last:
@@ -62,7 +64,8 @@ def find_windows(recording: CaseRecording, horizon: float, stride: float | None 
             stop = min(stop, last)
             if stop > row + 1 and end - time[stop - 1] < time[stop] - end:
                 stop -= 1
-            found.append((row, stop))
+            if time[stop] - time[row] <= 1.5 * horizon:
+                found.append((row, stop))
             row = stop if stride is None else max(int(np.searchsorted(time, time[row] + stride - slack)), row + 1)
             row = int(starts[np.searchsorted(starts, row)])
     return found

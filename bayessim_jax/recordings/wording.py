@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -47,12 +47,12 @@ class CaseError(ValueError):
 
 
 def merge(findings: Iterable[Finding]) -> list[Finding]:
-    """One finding for several that differ in nothing but the file."""
+    """One finding for several that differ in nothing but the file; for suspicions with one remedy, the first."""
     first: dict[tuple[object, ...], list[Finding]] = {}
     for finding in findings:
-        key = (finding.severity, finding.what, finding.remedy, finding.row)
-        first.setdefault(key, []).append(finding)
-    return [Finding(f[0].severity, f[0].file, *key[1:], others=len(f) - 1) for key, f in first.items()]  # type: ignore[arg-type]
+        same = finding.remedy if finding.severity == "suspicion" else (finding.what, finding.remedy, finding.row)
+        first.setdefault((finding.severity, same), []).append(finding)
+    return [replace(group[0], others=len({f.file for f in group}) - 1) for group in first.values()]
 
 
 def quote(text: object) -> str:

@@ -14,6 +14,7 @@ from bayessim_jax.cli.main import main
 from tests.recordings.made_up_case import CASE, MODEL, columns, csv_text, write_case
 
 DEGREES = 180 / np.pi
+QPOS = "joint/hinge/qpos"
 
 
 def contents(folder):
@@ -479,6 +480,13 @@ DOUBTFUL = {
     "one recording too short": (
         {"run1": columns(), "run2": columns(40)},
         ["run2.csv: holds no window of 0.5 s without a gap"],
+    ),
+    "degrees in two files": (
+        {
+            "run1": csv(qpos=lambda q: q * DEGREES),
+            "run2": csv_text(columns(300) | {QPOS: columns(300)[QPOS] * DEGREES}),
+        },
+        ["run1.csv and 1 more file: joint/hinge moves 57.", "qpos looks like degrees"],
     ),
     "a column in two files": (
         {"run1": csv(a=lambda t: t), "run2": csv(a=lambda t: t)},

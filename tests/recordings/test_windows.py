@@ -128,6 +128,19 @@ def test_a_wrapped_angle_is_made_continuous(tmp_path):
     np.testing.assert_allclose(np.diff(recording.qpos[:, 0]), np.diff(columns()[QPOS]), atol=1e-12)
 
 
+def test_a_fast_joint_does_not_wrap(tmp_path):
+    data = columns()
+    data[QPOS] = np.cumsum(np.full(400, 6.2))  # more than the simulator's joint does, but no turn that is lost
+    (recording,) = load_case(write_case(tmp_path, run1=data)).recordings
+    np.testing.assert_array_equal(recording.qpos[:, 0], data[QPOS])
+
+
+def test_no_window_where_rows_are_farther_apart_than_the_horizon(tmp_path):
+    case = loaded(tmp_path, run1=columns(200, 0.8))
+    assert [f.what for f in case.errors] == ["no recording holds a window of horizon = 0.5 s"]
+    assert any("looks like milliseconds" in f.what for f in case.findings)
+
+
 def test_resampling_interpolates_and_keeps_the_impulse(tmp_path):
     data = columns()
     data["time"][200:] += 1.0
