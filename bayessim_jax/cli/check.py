@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +35,8 @@ def check(words: Sequence[str]) -> int:
     from bayessim_jax.recordings.loading import load_case
     from bayessim_jax.recordings.overview import describe
 
+    if isinstance(sys.stdout, io.TextIOWrapper):  # names and units as they are, wherever they can be shown
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         loaded = load_case(command.case)
     except ValueError as error:

@@ -67,7 +67,7 @@ class Case:
         """The recordings, sorted by name, without hidden files; raises `CaseError` where there is none."""
         try:
             found = sorted(p for p in self.folder.glob(self.recordings) if p.is_file() and not p.name.startswith("."))
-        except (ValueError, NotImplementedError) as error:
+        except (ValueError, NotImplementedError, OSError) as error:
             what = f"recordings = {quote(self.recordings)} is no pattern ({error})"
             raise CaseError(FILE, what, "correct it, such as recordings/*.csv") from error
         if not found:
@@ -100,7 +100,7 @@ def read_case(folder: Path) -> Case:
 
 
 def _case(folder: Path, tables: dict[str, Any]) -> Case:
-    if "schema" in tables and tables["schema"] != SCHEMA:
+    if "schema" in tables and (tables["schema"] != SCHEMA or isinstance(tables["schema"], bool)):
         raise ValueError(f"schema is {quote(tables['schema'])}, this version reads {SCHEMA}; set schema = {SCHEMA}")
     _known(tables, KEYS, "")
     if "schema" not in tables:
@@ -145,7 +145,7 @@ def _parameters(tables: list[Any]) -> tuple[ParameterSpec, ...]:
         if name in (spec.name for spec in found):
             raise ValueError(f"{where} occurs twice; rename one, or give one both targets")
         targets = table.get("targets")
-        if isinstance(targets, str) or not targets or not all(isinstance(t, str) for t in _table(targets, where, list)):
+        if not (isinstance(targets, list) and targets and all(isinstance(t, str) for t in targets)):
             raise ValueError(f'{where}: targets is {quote(targets)}; it needs a list of paths, ["body/bob/mass"]')
         for target in targets:
             if target in taken:

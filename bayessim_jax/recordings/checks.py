@@ -44,7 +44,8 @@ def check_columns(file: str, table: Table, layout: Layout, columns: Mapping[str,
     for name in unused[:LISTED]:
         near = hint(name, [c for c in ("time", *layout.channels) if columns.get(c) not in names], 1)
         remedy = f"{near} Otherwise remove it or leave it" if near.startswith("did") else "remove it, or leave it"
-        found.append(Finding("warning", file, f"unknown column {quote(name)} is not used", remedy))
+        absent = ": the simulator has no such channel" if name.startswith(("joint/", "actuator/", "sensor/")) else ""
+        found.append(Finding("warning", file, f"unknown column {quote(name)} is not used{absent}", remedy))
     if more := unused[LISTED:]:
         shown = ", ".join(quote(name) for name in more[:LISTED]) + (", …" if len(more) > LISTED else "")
         what = f"{len(more)} more unknown columns are not used ({shown})"

@@ -49,7 +49,18 @@ def describe(loaded: LoadedCase) -> Iterator[str]:
         yield f"channel     {quote(name)[1:-1]} = {change}"
     for line in _velocities(loaded):
         yield f"velocity    {line}"
-    yield f"windows     {sum(counts)} of {case.horizon:g} s, from {_count(len(loaded.recordings), 'recording')}"
+    number = _count(len(loaded.recordings), "recording")
+    yield f"windows     {sum(counts)} of {case.horizon:g} s, from {number}{_rest(loaded)}"
+
+
+def _rest(loaded: LoadedCase) -> str:
+    """How much of the recordings lies in no window."""
+    total = used = 0.0
+    for recording in loaded.recordings:
+        time = recording.time
+        total += float(np.diff(time)[recording.valid].sum())
+        used += float(sum(time[stop] - time[start] for start, stop in find_windows(recording, loaded.case.horizon)))
+    return f"; {total - used:.4g} of {total:.4g} s lie in none of them"
 
 
 def _recording(recording: CaseRecording, count: int, loaded: LoadedCase) -> str:

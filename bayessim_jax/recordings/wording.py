@@ -58,7 +58,7 @@ def merge(findings: Iterable[Finding]) -> list[Finding]:
 def quote(text: object) -> str:
     """Text from a file as it may be shown: quoted, control characters escaped, cut where it is long."""
     shown = str(text)
-    return ascii(shown if len(shown) <= LONGEST else shown[: LONGEST - 1] + "…").replace("\\u2026", "…")
+    return repr(shown if len(shown) <= LONGEST else shown[: LONGEST - 1] + "…")
 
 
 def hint(word: str, known: Iterable[str], count: int = 3) -> str:

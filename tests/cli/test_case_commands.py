@@ -1,6 +1,7 @@
 """`bayessim check` and `bayessim new`: what is told of good cases, and one line for everything that is broken."""
 
 import io
+import os
 import pickle
 import shutil
 import subprocess
@@ -31,6 +32,7 @@ def test_a_good_case_is_described(tmp_path, capsys):
         "run1.csv: 400 rows, 3.99 s at 100 Hz; qpos 1/1, qvel 1/1, sensors 0/1, ctrl 1/1 measured; 7 windows"
         in told.out
     )
+    assert "windows     7 of 0.5 s, from 1 recording; 0.49 of 3.99 s lie in none of them" in told.out
     assert told.out.endswith("ok          the case can be used\n")
 
 
@@ -206,6 +208,9 @@ BROKEN = {
         {"case": CASE + CASE[CASE.index("[[") :].replace("body/bob/mass", "joint/hinge/damping")},
         ["parameter bob_mass occurs twice"],
     ),
+    "target that is no list": ({"case": toml(f"[{TARGET}]", TARGET)}, ["targets is 'body/bob/mass'; it needs a list"]),
+    "targets empty": ({"case": toml(TARGET, "")}, ["parameter bob_mass: targets is '[]'; it needs a list of paths"]),
+    "pattern that is none": ({"case": toml("*.csv", "**x")}, ["recordings = 'recordings/**x' is no pattern"]),
     "target twice": (
         {"case": CASE + CASE[CASE.index("[[") :].replace("bob_mass", "other")},
         ["parameter other: target 'body/bob/mass' is bob_mass's already"],
@@ -422,14 +427,22 @@ DOUBTFUL = {
         {"run1": csv(temperature=lambda t: 20 + t)},
         ["run1.csv: unknown column 'temperature' is not used"],
     ),
+    "column of an unknown joint": (
+        {"run1": csv(**{"joint/elbow/qpos": lambda t: t})},
+        ["unknown column 'joint/elbow/qpos' is not used: the simulator has no such channel"],
+    ),
     "near miss of a sensor": (
         {"run1": csv(**{"sensor/encodr": lambda t: t})},
-        ["unknown column 'sensor/encodr' is not used", "did you mean 'sensor/encoder'?"],
+        [
+            "unknown column 'sensor/encodr' is not used: the simulator has no such channel",
+            "did you mean 'sensor/encoder'?",
+        ],
     ),
     "HTML in a column": (
         {"run1": csv(**{"<script>alert(1)</script>": lambda t: t})},
         ["unknown column '<script>alert(1)</script>' is not used"],
     ),
+    "letters in a column": ({"run1": csv(größe=lambda t: t)}, ["unknown column 'größe' is not used"]),
     "escape sequence in a column": ({"run1": csv(**{"\x1b[31mred": lambda t: t})}, [r"unknown column '\x1b[31mred'"]),
     "unused text": ({"run1": csv(note=lambda t: ["ok"] * len(t))}, ["unknown column 'note' is not used"]),
     "position in degrees": (
@@ -507,6 +520,16 @@ def test_what_is_doubtful_or_not_used_gets_a_line_and_the_case_can_be_used(tmp_p
     for fragment in fragments:
         assert fragment in remarks[0]
     assert "\x1b" not in told.out
+
+
+def test_names_are_shown_wherever_the_terminal_can(tmp_path):
+    folder = write_case(tmp_path / "case", case=toml('"kg"', '"kg²"'))
+    code = f"import sys\nfrom bayessim_jax.cli.main import main\nsys.exit(main(['check', {str(folder)!r}]))"
+    for encoding, shown in (("utf-8", "kg²"), ("ascii", r"kg\xb2")):
+        environment = os.environ | {"PYTHONIOENCODING": encoding}
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, env=environment, timeout=120)
+        assert done.returncode == 0, done.stderr
+        assert shown in done.stdout.decode(encoding)
 
 
 @pytest.mark.parametrize(
