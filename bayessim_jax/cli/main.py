@@ -20,6 +20,8 @@ Bayesian inference of simulator parameters, composed with the learning of a cont
 
 commands:
   online SYSTEM   learn a system's parameters and its controller together (bayessim online --help)
+  new CASE        make a case folder from a MuJoCo model (bayessim new --help)
+  check CASE      print what a case holds and what is wrong with it
   report RUN      write the report of a run folder again
   systems         what can be identified: parameters, units, priors
 
@@ -28,7 +30,7 @@ options:
   --version       show the version
   --citations     BibTeX of what this package builds on (bayessim --citations RUN: of what that run used)
 """
-COMMANDS = ("online", "report", "systems")
+COMMANDS = ("online", "new", "check", "report", "systems")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -62,6 +64,14 @@ def _dispatch(words: list[str]) -> int:
         from bayessim_jax.cli.online import online
 
         return online(rest)
+    if first == "new":
+        from bayessim_jax.cli.new import new
+
+        return new(rest)
+    if first == "check":
+        from bayessim_jax.cli.check import check
+
+        return check(rest)
     if first == "report":
         from bayessim_jax.cli.report import report
 

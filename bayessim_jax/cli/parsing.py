@@ -83,4 +83,6 @@ def _one_line(text: str, prog: str) -> str:
         return f"{name} {reason}" if name.startswith("--") else reason
     if match := re.match(r"Missing from .*?: *\{(.*?)\}", message):
         return f"{prog} needs one of {match[1].replace(',', ', ')} after it; see {prog} --help."
+    if match := re.search(r"Missing from [^:]*:\s+(--\S+ \S+|\S+)", message):
+        return f"{prog} needs {match[1]}; see {prog} --help."
     return f"{message} (see {prog} --help)"

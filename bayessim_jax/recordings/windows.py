@@ -1,0 +1,100 @@
+"""Windows of a fixed length, each restarted from the recording; none of them spans a gap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from bayessim_jax.recordings.recording import CaseRecording, Span
+
+__all__ = ["Windows", "find_windows", "stack_windows"]
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Windows of one or several recordings, padded with zeros to the longest.
+
+    Row 0 of a window is where the simulation starts. `valid[w, t]` is false on padded transitions; the masks
+    `*_measured` are false on padded rows.
+    """
+
+    recording: Int[np.ndarray, " windows"]
+    """Which recording each window is of."""
+    start: Float[np.ndarray, " windows"]
+    """When it begins, in the recording's own time, s."""
+    time: Float[np.ndarray, "windows rows"]
+    """s since the window's start."""
+    ctrl: Float[np.ndarray, "windows steps nu"]
+    qpos: Float[np.ndarray, "windows rows nq"]
+    qvel: Float[np.ndarray, "windows rows nv"]
+    sensors: Float[np.ndarray, "windows rows ns"]
+    qpos_measured: Bool[np.ndarray, "windows rows nq"]
+    qvel_measured: Bool[np.ndarray, "windows rows nv"]
+    sensors_measured: Bool[np.ndarray, "windows rows ns"]
+    valid: Bool[np.ndarray, "windows steps"]
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+
+def find_windows(recording: CaseRecording, horizon: float, stride: float | None = None) -> list[Span]:
+    """First and last row of every window of `horizon` seconds in a recording.
+
+    The next window starts where the last one ended, or `stride` seconds after its start. A window ends at the row
+    nearest to its nominal end; where rows lie so far apart that it would be half as long again, it is not made.
+    """
+    found, time = [], recording.time
+    starts = np.append(np.flatnonzero(recording.known), len(time))
+    for first, last in recording.spans:
+        if last - first < 2 or np.median(np.diff(time[first : last + 1])) > horizon:
+            continue
+        slack = float(np.median(np.diff(time[first : last + 1]))) / 2 * (1 + 1e-6)
+        row = int(starts[np.searchsorted(starts, first)])
+        while row < last:
+            end = time[row] + horizon
+            if end > time[last] + slack:
+                break
+            stop = int(np.searchsorted(time[: last + 1], end))
+            stop = min(stop, last)
+            if stop > row + 1 and end - time[stop - 1] < time[stop] - end:
+                stop -= 1
+            if time[stop] - time[row] <= 1.5 * horizon:
+                found.append((row, stop))
+            row = stop if stride is None else max(int(np.searchsorted(time, time[row] + stride - slack)), row + 1)
+            row = int(starts[np.searchsorted(starts, row)])
+    return found
+
+
+def stack_windows(recordings: Sequence[CaseRecording], horizon: float, stride: float | None = None) -> Windows:
+    """Every window of several recordings in padded arrays."""
+    found = [(i, r, span) for i, r in enumerate(recordings) for span in find_windows(r, horizon, stride)]
+    if not found:
+        raise ValueError(f"no recording holds {horizon:g} s without a gap; choose a shorter horizon.")
+    rows = max(stop - start for _, _, (start, stop) in found) + 1
+
+    def stacked(name: str, length: int) -> np.ndarray:
+        example = getattr(found[0][1], name)
+        out = np.zeros((len(found), length, *example.shape[1:]), example.dtype)
+        for w, (_, recording, (start, stop)) in enumerate(found):
+            part = getattr(recording, name)[start : stop + (length == rows)]
+            out[w, : len(part)] = part
+        return out
+
+    starts = np.array([r.time[start] for _, r, (start, _) in found])
+    time = stacked("time", rows)
+    inside = np.arange(rows) <= np.array([stop - start for _, _, (start, stop) in found])[:, None]
+    names = ("qpos", "qvel", "sensors", "qpos_measured", "qvel_measured", "sensors_measured")
+    return Windows(
+        recording=np.array([i for i, _, _ in found]),
+        start=starts,
+        time=np.where(inside, time - starts[:, None], 0.0),
+        ctrl=stacked("ctrl", rows - 1),
+        valid=stacked("valid", rows - 1),
+        **{name: stacked(name, rows) for name in names},
+    )

@@ -1,0 +1,80 @@
+"""The recordings of real rigs: every case is read, and what is told of it is what is known of the rig."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bayessim_jax import systems
+from bayessim_jax.recordings.loading import load_case
+
+ROOT = Path(__file__).parents[2]
+CASES = Path(os.environ.get("BAYESSIM_CASES", ROOT.parent / "shared" / "data" / "cases"))
+pytestmark = pytest.mark.skipif(not CASES.is_dir(), reason="the real recordings are not here; set BAYESSIM_CASES")
+
+KNOWN = {
+    # case: (recordings, rows of the first one, rate in Hz, measured velocities, windows)
+    "emps": (5, 1242, 250, 0, 45),
+    "dfki_double_pendulum": (10, 1999, 250, 2, 142),
+    "dfki_simple_pendulum": (4, 749, 250, 1, 16),
+    "multiarm_single": (4, 2292, 250, 1, 16),
+    "multiarm_double": (12, 667, 250, 2, 24),
+    "bam_xl330": (8, 1198, 200, 0, 88),
+    "contactnets_cube": (20, 105, 148, 6, 20),
+}
+
+
+@pytest.mark.parametrize("name", KNOWN)
+def test_a_case_is_read_without_remarks(name):
+    loaded = load_case(CASES / name).check()
+    assert loaded.findings == ()
+    recordings, rows, rate, velocities, windows = KNOWN[name]
+    first = loaded.recordings[0]
+    assert (len(loaded.recordings), len(first.time), round(1 / first.step)) == (recordings, rows, rate)
+    assert int(first.qvel_measured.all(0).sum()) == velocities
+    stacked = loaded.windows()
+    assert len(stacked) == windows
+    assert stacked.valid.all(1).all() or name == "contactnets_cube"
+    np.testing.assert_allclose(stacked.time.max(1), loaded.case.horizon, atol=first.step / 2)
+    for parameter in loaded.parameters:
+        assert parameter.prior.low <= parameter.nominal <= parameter.prior.high
+        _, model = loaded.augmented({parameter.name: parameter.prior.mean})
+        assert model.nq == loaded.model.nq
+
+
+@pytest.mark.parametrize("name", ["multiarm_single", "multiarm_double", "dfki_double_pendulum"])
+def test_estimated_velocities_agree_with_those_of_the_authors(name):
+    loaded = load_case(CASES / name)
+    from bayessim_jax.recordings.velocity import estimate_slopes
+
+    for recording in loaded.recordings[:3]:
+        for i in range(recording.qpos.shape[1]):
+            slopes, _ = estimate_slopes(recording.time, recording.qpos[:, i], ~recording.valid)
+            assert np.std(slopes - recording.qvel[:, i]) < 0.05 * np.std(recording.qvel[:, i])
+
+
+@pytest.mark.parametrize("name", ["warthog_asphalt", "warthog_ice"])
+def test_a_case_of_a_registered_system(name, monkeypatch):
+    from bayessim_jax.contracts import Box
+
+    class Drive:
+        parameters = Box.create(wheel_radius=(0.2, 0.4, "m"), axial_distance=(0.8, 1.6, "m"), icr_offset=(-1, 1, "m"))
+        observations = Box.create(**{"base/x": (-9, 9, "m"), "base/y": (-9, 9, "m"), "base/yaw": (-9, 9, "rad")})
+        actions = Box.create(**{"input/left": (-9, 9, "rad/s"), "input/right": (-9, 9, "rad/s")})
+
+    entry = systems.Entry(Drive, Drive, "ppo", "a vehicle")
+    monkeypatch.setitem(systems.SYSTEMS, "skid_steer", entry)
+    loaded = load_case(CASES / name).check()
+    assert len(loaded.recordings) == 60
+    assert [p.targets for p in loaded.parameters] == [("wheel_radius",), ("axial_distance",), ("icr_offset",)]
+    unused = [finding for finding in loaded.findings if "unknown column" in finding.what]
+    assert [(f.what, f.others) for f in unused] == [
+        ("unknown column 'wheel/left' is not used", 59),
+        ("unknown column 'wheel/right' is not used", 59),
+    ]
+    assert len(unused) == len(loaded.findings)
+    stacked = loaded.windows()
+    assert stacked.sensors.shape[1:] == (21, 3)
+    assert stacked.sensors_measured.all()
+    assert len(stacked) == 60
