@@ -18,7 +18,7 @@ PRIORS = [
 ]
 
 
-@pytest.mark.parametrize(("prior", "reference"), PRIORS, ids=str)
+@pytest.mark.parametrize(("prior", "reference"), PRIORS, ids=[str(prior) for prior, _ in PRIORS])
 def test_moments_and_densities(prior, reference):
     ends = prior.quantile([1e-9, 1 - 1e-9])
     assert integrate.quad(lambda x: np.exp(prior.log_prob(x)), *ends, limit=200)[0] == pytest.approx(1, abs=1e-6)
