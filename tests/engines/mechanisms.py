@@ -63,6 +63,24 @@ MODELS = {
         '<motor name="push" joint="x"/><motor name="spin" joint="turn" gear="0.5"/>',
         integrator="Euler",
     ),
+    "limits": wrap(
+        link("l0", link("l1", pos="0 0 -0.4", joint='range="-0.3 0.5" limited="true" margin="0.02"'))
+        + link(
+            "l2",
+            pos="1 0 0",
+            joint='range="-0.2 0.2" limited="true" solreflimit="-900 -40" solimplimit="0.8 0.9 0.01 0.4 3"',
+        ),
+        '<motor name="m0" joint="l0" gear="2"/><motor name="m1" joint="l1"/>',
+    ),
+    "dry_friction": wrap(
+        link(
+            "l0",
+            link("l1", link("l2", pos="0 0 -0.4", axis="1 0 0", joint='frictionloss="0.2"'), pos="0 0 -0.4"),
+            joint='frictionloss="0.8" damping="0.1" range="-0.7 0.4" limited="true"',
+        ),
+        '<motor name="m0" joint="l0" gear="4"/><motor name="m2" joint="l2" gear="0.5"/>',
+        integrator="Euler",
+    ),
     "runge_kutta": wrap(link("l0", link("l1", pos="0 0 -0.4")), '<motor name="m0" joint="l0"/>', integrator="RK4"),
 }
 

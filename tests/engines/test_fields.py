@@ -14,8 +14,14 @@ from tests.engines.mechanisms import HOPPER, MODELS
 
 
 def scale_mass(spec, value):
-    body = spec.body("l1")
+    body = spec.body("l2")
     body.fullinertia = body.fullinertia * value / body.mass
+    body.mass = value
+
+
+def scale_inertia(spec, value):
+    body = spec.body("l1")
+    body.inertia = body.inertia * value / body.mass
     body.mass = value
 
 
@@ -46,7 +52,7 @@ def set_range(spec, value):
 
 
 SMOOTH = {
-    "body/l1/mass": ("spatial_arm", 2.3, scale_mass),
+    "body/l2/mass": ("spatial_arm", 2.3, scale_mass),
     "body/l2/ipos/0": ("spatial_arm", 0.2, put("body", "l2", "ipos", 0)),
     "body/l2/pos/2": ("six_joint_arm", 0.4, put("body", "l2", "pos", 2)),
     "body/l0/inertia/1": ("pendulum", 0.013, put("body", "l0", "inertia", 1)),
@@ -58,6 +64,8 @@ SMOOTH = {
     "actuator/m1/gain": ("spatial_arm", 1.8, put("actuator", "m1", "gainprm", 0)),
     "actuator/servo/gain": ("springs", 9.0, set_kp),
     "actuator/push/ctrlrange": ("cart_pole", 0.4, set_range),
+    "joint/l0/frictionloss": ("pendulum", 0.3, put("joint", "l0", "frictionloss")),
+    "body/l1/mass": ("limits", 1.7, scale_inertia),
     "option/gravity/2": ("spatial_arm", -3.7, set_gravity),
 }
 CONTACT = {

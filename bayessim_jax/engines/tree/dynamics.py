@@ -7,6 +7,7 @@ Source: Featherstone 2008, ch. 5 and 6
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -59,8 +60,9 @@ def _place(link: Link, moved: Folded) -> Pose:
     if link.slides:
         return Pose(link.rotation, add(link.offset, scale(moved * link.sign, columns[link.axis])))
     if moved.known:
-        raise ValueError("place_links: positions must be arrays.")
-    sine, cosine = (fold(x) for x in sincos(moved.value))
+        sine, cosine = fold(math.sin(moved.value)), fold(math.cos(moved.value))
+    else:
+        sine, cosine = (fold(x) for x in sincos(moved.value))
     s = sine * link.sign
     j, k = (link.axis + 1) % 3, (link.axis + 2) % 3
     turned = list(columns)

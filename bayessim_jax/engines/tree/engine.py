@@ -15,7 +15,7 @@ from bayessim_jax.contracts import Scalar
 from bayessim_jax.engines.fields import Write
 from bayessim_jax.engines.tree.folding import Folded, fold, settle
 from bayessim_jax.engines.tree.integrate import advance
-from bayessim_jax.engines.tree.links import build_links, read_numbers
+from bayessim_jax.engines.tree.prepare import prepare
 from bayessim_jax.engines.tree.support import find_refusals
 
 __all__ = ["TreeEngine", "TreeState"]
@@ -95,13 +95,12 @@ class TreeEngine:
 
     def _prepare(self, theta: Float[Array, " d"]) -> Step:
         """One time step with θ written in; what depends on θ alone is computed outside of loops."""
-        numbers = read_numbers(self.model, self.writes, [theta[k] for k in range(theta.shape[0])])
-        links = build_links(self.model, numbers)
+        tree = prepare(self.model, self.writes, [theta[k] for k in range(theta.shape[0])])
 
         def once(state: TreeState, ctrl: Sequence[Scalar], applied: Sequence[Scalar] | None) -> TreeState:
             forces = [fold(0.0)] * self.model.nv if applied is None else _fold_all(applied)
             q, v = _fold_all(state.qpos), _fold_all(state.qvel)
-            q, v = advance(self.model, numbers, links, q, v, _fold_all(ctrl), forces)
+            q, v = advance(tree, q, v, _fold_all(ctrl), forces)
             return TreeState(tuple(x.value for x in q), tuple(x.value for x in v))
 
         return once

@@ -12,24 +12,6 @@ from bayessim_jax.engines.fields import Write
 
 __all__ = ["find_refusals"]
 
-WRITABLE = {
-    "body_mass",
-    "body_inertia",
-    "body_ipos",
-    "body_pos",
-    "dof_damping",
-    "dof_armature",
-    "dof_frictionloss",
-    "jnt_stiffness",
-    "qpos_spring",
-    "actuator_gear",
-    "actuator_gainprm",
-    "actuator_biasprm",
-    "actuator_ctrlrange",
-    "gravity",
-    "geom_friction",
-    "geom_size",
-}
 INTEGRATORS = {
     mujoco.mjtIntegrator.mjINT_EULER,
     mujoco.mjtIntegrator.mjINT_RK4,
@@ -69,8 +51,7 @@ def _elements(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def _joints(model: mujoco.MjModel, writes: Sequence[Write]) -> Iterator[str]:
-    bit, kinds = mujoco.mjtDisableBit, mujoco.mjtJoint
-    constrained = not model.opt.disableflags & bit.mjDSBL_CONSTRAINT
+    kinds = mujoco.mjtJoint
     written = {w.index[0] for w in writes if w.field == "dof_frictionloss"}
     for joint in range(model.njnt):
         name, kind = f"joint/{model.joint(joint).name or f'#{joint}'}", model.jnt_type[joint]
@@ -78,13 +59,11 @@ def _joints(model: mujoco.MjModel, writes: Sequence[Write]) -> Iterator[str]:
             yield f"{name} is a {'ball' if kind == kinds.mjJNT_BALL else 'free'} joint"
             continue
         dof = int(model.jnt_dofadr[joint])
-        if constrained and model.jnt_limited[joint] and not model.opt.disableflags & bit.mjDSBL_LIMIT:
-            yield f"{name} is limited to a range"
-        if constrained and not model.opt.disableflags & bit.mjDSBL_FRICTIONLOSS:
-            if model.dof_frictionloss[dof] > 0.0:
-                yield f"{name} has frictionloss"
-            elif dof in written:
-                yield f"{name} has frictionloss as a parameter"
+        if model.opt.noslip_iterations and (model.dof_frictionloss[dof] > 0.0 or dof in written):
+            yield f"{name} has frictionloss, which option/noslip_iterations treats in its own way"
+        for what, solref in (("limit", model.jnt_solref[joint]), ("friction", model.dof_solref[dof])):
+            if (solref[0] > 0.0) != (solref[1] > 0.0):
+                yield f"{name} has a {what} of mixed solref"
         if np.any(model.dof_dampingpoly[dof]) or np.any(model.jnt_stiffnesspoly[joint]):
             yield f"{name} has nonlinear damping or stiffness"
 
