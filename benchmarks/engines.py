@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from bayessim_jax.engines.batch import compile_batched
+from bayessim_jax.engines.batch import compile_batched, compile_spread, forward_jacobians
 from bayessim_jax.engines.fields import Write, find_writes, merge_writes
 from bayessim_jax.engines.models import ModelBank
 from bayessim_jax.engines.mujoco import MujocoEngine, count_cores
@@ -183,14 +183,10 @@ def _compare_jacobian(name: str, problem: Problem, repeats: int) -> None:
     def last(theta: Any, qpos: Any, ctrls: Any) -> Any:
         return jax.tree.map(lambda leaf: leaf[-1], trajectory(theta, qpos, ctrls))
 
-    def jacobian(theta: Any, qpos: Any, ctrls: Any) -> Any:
-        tangent = lambda direction: jax.jvp(lambda t: last(t, qpos, ctrls), (theta,), (direction,))  # noqa: E731
-        return jax.vmap(tangent)(directions)
-
     inputs = problem.thetas, problem.qpos, problem.ctrls
     forward, placed = compile_batched(last, *inputs)
     start = now()
-    derivative, _ = compile_batched(jacobian, *inputs)
+    derivative, _ = compile_spread(forward_jacobians(last, directions), *inputs)
     seconds = now() - start
     _, _, ratio = _paired(
         lambda: jax.block_until_ready(forward(*placed)), lambda: jax.block_until_ready(derivative(*placed)), repeats

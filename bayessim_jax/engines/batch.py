@@ -6,10 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float
 
-__all__ = ["CPU_OPTIONS", "compile_batched"]
+__all__ = ["CPU_OPTIONS", "compile_batched", "compile_spread", "forward_jacobians"]
 
 CPU_OPTIONS = {
     "xla_disable_hlo_passes": "cpu-parallel-task-assigner,cse_barrier_expander",
@@ -28,6 +30,11 @@ def compile_batched(function: Callable[..., Any], *arguments: Any, out_axes: int
     A CPU counts as as many devices as `jax_num_cpu_devices` says; the batch is cut over them if it can be evenly.
     Made for the tree engine: programs with callbacks stay on one device, whose callback has all processors.
     """
+    return compile_spread(jax.vmap(function, out_axes=out_axes), *arguments)
+
+
+def compile_spread(function: Callable[..., Any], *arguments: Any) -> tuple[Any, tuple[Any, ...]]:
+    """The same for a function that takes the whole batch."""
     size = jax.tree.leaves(arguments)[0].shape[0]
     devices = np.array(jax.devices())
     if size % devices.size:
@@ -35,5 +42,20 @@ def compile_batched(function: Callable[..., Any], *arguments: Any, out_axes: int
     sharding = NamedSharding(Mesh(devices, ("batch",)), PartitionSpec("batch"))
     placed = jax.device_put(arguments, sharding)
     options: Any = CPU_OPTIONS if jax.default_backend() == "cpu" else None
-    lowered = jax.jit(jax.vmap(function, out_axes=out_axes)).lower(*placed)
-    return lowered.compile(compiler_options=options), placed
+    return jax.jit(function).lower(*placed).compile(compiler_options=options), placed
+
+
+def forward_jacobians(function: Callable[..., Any], directions: Float[Array, "k d"]) -> Callable[..., Any]:
+    """From f(θ, …) of one trajectory, the values and derivatives along directions of θ for a batch (leading axis: k).
+
+    Directions come before the batch, so that values are shared and the batch stays what vectors are made of.
+    """
+
+    def over_batch(thetas: Float[Array, "n d"], *rest: Any) -> tuple[Any, Any]:
+        def along(direction: Float[Array, " d"]) -> tuple[Any, Any]:
+            tangents = jnp.broadcast_to(direction, thetas.shape)
+            return jax.jvp(lambda t: jax.vmap(function)(t, *rest), (thetas,), (tangents,))
+
+        return jax.vmap(along, out_axes=(None, 0))(directions)
+
+    return over_batch
