@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from bayessim_jax.contracts import Scalar
-from bayessim_jax.engines.tree.folding import Folded, fold
+from bayessim_jax.engines.tree.folding import Folded, fold, settle
 from bayessim_jax.engines.tree.links import Numbers
 from bayessim_jax.engines.tree.solve import add_to_diagonal, solve
 
@@ -99,7 +99,7 @@ def constraint_forces(
 
     Newton's method: while no constraint changes the piece of its force, one linear system gives the solution.
     """
-    rows = [_row(c, numbers, weights[c.joint], q[c.joint], v[c.joint]) for c in constraints]
+    rows = [_settle(_row(c, numbers, weights[c.joint], q[c.joint], v[c.joint])) for c in constraints]
     problem = _Problem(constraints, rows, matrix, right)
 
     def improve(accelerations: tuple[Scalar, ...], _: None) -> tuple[tuple[Scalar, ...], None]:
@@ -134,6 +134,11 @@ def _row(c: Constraint, numbers: Numbers, weight: Folded, q: Folded, v: Folded) 
     return _Row(impedance / (weight * (1.0 - impedance)), reference, fold(0.0), near)
 
 
+def _settle(row: _Row) -> _Row:
+    gain, reference = settle(row.gain, row.reference)
+    return row._replace(gain=gain, reference=reference)
+
+
 def _linear(c: Constraint, row: _Row, acceleration: Folded) -> tuple[Folded, Folded]:
     """(s, o) of the piece of the force o − s a that holds at an acceleration."""
     push = (row.reference - acceleration) * row.gain
@@ -166,7 +171,7 @@ class _Problem(NamedTuple):
         for c, (slope, offset) in zip(self.constraints, pieces, strict=True):
             diagonal[c.joint] = diagonal[c.joint] + slope
             push[c.joint] = push[c.joint] + offset
-        return solve(add_to_diagonal(self.matrix, diagonal), push)
+        return list(settle(*solve(add_to_diagonal(self.matrix, settle(*diagonal)), settle(*push))))
 
     def forces(self, accelerations: Sequence[Folded]) -> list[Folded]:
         """f(a), on every joint."""
@@ -180,22 +185,23 @@ class _Problem(NamedTuple):
         """The least on the way from here to there, to a few halvings by regula falsi; `there` if it is downhill yet."""
         ahead = [b - a for a, b in zip(here, there, strict=True)]
         slope = _inner(ahead, self._smooth_gradient(here))
-        curvature = _inner(ahead, [_inner(row, ahead) for row in self.matrix])
+        slope, curvature = settle(slope, _inner(ahead, [_inner(row, ahead) for row in self.matrix]))
 
         def derivative(t: Folded) -> Folded:
             forces = self.forces([a + d * t for a, d in zip(here, ahead, strict=True)])
-            return slope + curvature * t - _inner(ahead, forces)
+            return settle(slope + curvature * t - _inner(ahead, forces))[0]
 
         low, high = fold(0.0), fold(1.0)
         at_low, at_high = derivative(low), derivative(high)
         downhill = at_high.value <= 0.0
         for _ in range(SEARCHES):
-            t = _between(low, high, at_low, at_high)
+            (t,) = settle(_between(low, high, at_low, at_high))
             at = derivative(t)
             below = at.value < 0.0
             low, high = _pick(below, t, low), _pick(below, high, t)
             at_low, at_high = _pick(below, at, at_low * 0.5), _pick(below, at_high * 0.5, at)
-        step = _pick(downhill, fold(1.0), _between(low, high, at_low, at_high))
+            low, high, at_low, at_high = settle(low, high, at_low, at_high)
+        (step,) = settle(_pick(downhill, fold(1.0), _between(low, high, at_low, at_high)))
         return [a + d * step for a, d in zip(here, ahead, strict=True)]
 
     def _smooth_gradient(self, accelerations: Sequence[Folded]) -> list[Folded]:
