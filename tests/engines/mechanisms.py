@@ -81,6 +81,7 @@ MODELS = {
         '<motor name="m0" joint="l0" gear="4"/><motor name="m2" joint="l2" gear="0.5"/>',
         integrator="Euler",
     ),
+    "coupled_constraints": arm(4).replace("damping=", 'frictionloss="0.5" range="-0.9 0.9" limited="true" damping='),
     "runge_kutta": wrap(link("l0", link("l1", pos="0 0 -0.4")), '<motor name="m0" joint="l0"/>', integrator="RK4"),
 }
 

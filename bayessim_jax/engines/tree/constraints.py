@@ -97,20 +97,17 @@ def constraint_forces(
 ) -> list[Folded]:
     """Forces of all constraints on the joints, with M a = right where there are none.
 
-    Newton's method: while no constraint changes the piece of its force, one linear system gives the solution.
+    Newton's method with a search along each step finds which piece of its force each constraint is on; then one linear
+    system gives the solution, and its derivatives are those of the solution.
     """
     rows = [_settle(_row(c, numbers, weights[c.joint], q[c.joint], v[c.joint])) for c in constraints]
     problem = _Problem(constraints, rows, matrix, right)
-
-    def improve(accelerations: tuple[Scalar, ...], _: None) -> tuple[tuple[Scalar, ...], None]:
-        here = _fold_all(accelerations)
-        there = problem.solve_pieces([_linear(c, r, here[c.joint]) for c, r in zip(constraints, rows, strict=True)])
-        return tuple(x.value for x in problem.search(here, there)), None
-
-    start = problem.solve_pieces([_sticking(c, row) for c, row in zip(constraints, rows, strict=True)])
-    rounds = 2 + 2 * len({c.joint for c in constraints})
-    found, _ = jax.lax.scan(improve, tuple(x.value for x in start), length=rounds)
-    return problem.forces(_fold_all(found))
+    pieces = problem.pieces(problem.freeze().find())
+    accelerations = problem.solve_pieces(pieces)
+    forces = [fold(0.0)] * len(right)
+    for c, (slope, offset) in zip(constraints, pieces, strict=True):
+        forces[c.joint] = forces[c.joint] + offset - slope * accelerations[c.joint]
+    return forces
 
 
 class _Row(NamedTuple):
@@ -165,6 +162,28 @@ class _Problem(NamedTuple):
     matrix: Sequence[Sequence[Folded]]
     right: Sequence[Folded]
 
+    def freeze(self) -> _Problem:
+        """The same numbers without derivatives."""
+        rows = [_Row(_stop(r.gain), _stop(r.reference), _stop(r.friction), r.near) for r in self.rows]
+        matrix = [[_stop(x) for x in line] for line in self.matrix]
+        return _Problem(self.constraints, rows, matrix, [_stop(x) for x in self.right])
+
+    def find(self) -> list[Folded]:
+        """The solution, up to rounding."""
+
+        def improve(accelerations: tuple[Scalar, ...], _: None) -> tuple[tuple[Scalar, ...], None]:
+            here = [fold(x) for x in accelerations]
+            return tuple(x.value for x in self.search(here, self.solve_pieces(self.pieces(here)))), None
+
+        start = self.solve_pieces([_sticking(c, row) for c, row in zip(self.constraints, self.rows, strict=True)])
+        rounds = 2 + 2 * len({c.joint for c in self.constraints})
+        found, _ = jax.lax.scan(improve, tuple(x.value for x in start), length=rounds)
+        return [fold(x) for x in found]
+
+    def pieces(self, accelerations: Sequence[Folded]) -> list[tuple[Folded, Folded]]:
+        """The piece of every constraint's force that holds at accelerations."""
+        return [_linear(c, r, accelerations[c.joint]) for c, r in zip(self.constraints, self.rows, strict=True)]
+
     def solve_pieces(self, pieces: Sequence[tuple[Folded, Folded]]) -> list[Folded]:
         """The solution if these pieces of the forces held everywhere."""
         diagonal, push = [fold(0.0)] * len(self.right), list(self.right)
@@ -176,8 +195,7 @@ class _Problem(NamedTuple):
     def forces(self, accelerations: Sequence[Folded]) -> list[Folded]:
         """f(a), on every joint."""
         forces = [fold(0.0)] * len(self.right)
-        for c, row in zip(self.constraints, self.rows, strict=True):
-            slope, offset = _linear(c, row, accelerations[c.joint])
+        for c, (slope, offset) in zip(self.constraints, self.pieces(accelerations), strict=True):
             forces[c.joint] = forces[c.joint] + offset - slope * accelerations[c.joint]
         return forces
 
@@ -228,8 +246,8 @@ def _pick(condition: Scalar, a: Folded, b: Folded) -> Folded:
     return Folded(jnp.where(condition, a.value, b.value))
 
 
-def _fold_all(values: Sequence[Scalar]) -> list[Folded]:
-    return [fold(x) for x in values]
+def _stop(x: Folded) -> Folded:
+    return x if x.known else Folded(jax.lax.stop_gradient(x.value))
 
 
 def _varies(c: Constraint) -> bool:
