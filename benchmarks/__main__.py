@@ -1,11 +1,14 @@
-"""Benchmarks against other projects: `python -m benchmarks online | estimator | scaling`."""
+"""Benchmarks against other projects: `python -m benchmarks online | estimator | scaling | engines`."""
 
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 
 from benchmarks.timing import CLOCKS, choose_clock
+
+_MECHANISMS = ("pendulum", "cart-pole", "double pendulum", "3-joint arm", "6-joint arm")
 
 
 def main() -> None:
@@ -36,7 +39,14 @@ def main() -> None:
     scaling.add_argument("--repeats", type=int, default=3)
     scaling.add_argument("--figure", type=Path, default=Path("docs/figures/scaling.svg"))
 
-    for command in (online, estimator, scaling):
+    engines = commands.add_parser("engines", help="steps per second against MuJoCo's C engine and MJX")
+    engines.add_argument("--models", nargs="+", default=[*_MECHANISMS], choices=_MECHANISMS)
+    engines.add_argument("--batches", type=int, nargs="+", default=[64, 256, 1024, 4096])
+    engines.add_argument("--steps", type=int, default=200)
+    engines.add_argument("--repeats", type=int, default=5)
+    engines.add_argument("--mjx", type=int, default=1024, metavar="BATCH", help="batch of MJX; 0 leaves it out")
+
+    for command in (online, estimator, scaling, engines):
         command.add_argument("--clock", choices=CLOCKS, default="wall", help="cpu: seconds summed over threads")
 
     options = parser.parse_args()
@@ -49,10 +59,22 @@ def main() -> None:
         from benchmarks.estimator import compare_estimators
 
         compare_estimators(options)
+    elif options.command == "engines":
+        _use_all_cores()
+        from benchmarks.engines import compare_engines
+
+        compare_engines(options)
     else:
         from benchmarks.scaling import measure_scaling
 
         measure_scaling(options)
+
+
+def _use_all_cores() -> None:
+    """One JAX device for each processor, as the tree engine's batches are spread."""
+    import jax
+
+    jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:

@@ -1,0 +1,40 @@
+"""A batch compiled for all processors is the batch."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from bayessim_jax.engines.batch import compile_batched, compile_spread, forward_jacobians
+from bayessim_jax.engines.fields import find_writes, merge_writes
+from bayessim_jax.engines.tree import TreeEngine
+from tests.engines.mechanisms import MODELS
+
+THETAS = np.random.default_rng(0).uniform([0.5, -11.0], [1.5, -9.0], (8, 2)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def last():
+    model = mujoco.MjModel.from_xml_string(MODELS["spatial_arm"])
+    paths = ["body/l1/mass", "option/gravity/2"]
+    engine = TreeEngine(model, merge_writes([find_writes(model, [p], k) for k, p in enumerate(paths)]))
+
+    def run(theta):
+        start = engine.init(theta, jnp.full(3, 0.3), jnp.zeros(3))
+        return engine.qpos(jax.tree.map(lambda x: x[-1], engine.replay(theta, start, jnp.ones((20, 3)))))
+
+    return run
+
+
+def test_a_spread_batch_is_the_batch(last):
+    compiled, placed = compile_batched(last, THETAS)
+    np.testing.assert_allclose(compiled(*placed), jax.jit(jax.vmap(last))(THETAS), rtol=1e-5, atol=1e-6)
+
+
+def test_jacobians_of_a_batch_are_those_of_each(last):
+    compiled, placed = compile_spread(forward_jacobians(last, jnp.eye(2)), THETAS)
+    values, tangents = compiled(*placed)
+    np.testing.assert_allclose(values, jax.jit(jax.vmap(last))(THETAS), rtol=1e-5, atol=1e-6)
+    each = jax.jit(jax.vmap(jax.jacfwd(last)))(THETAS)
+    np.testing.assert_allclose(jnp.moveaxis(tangents, 0, -1), each, rtol=1e-3, atol=1e-6)
