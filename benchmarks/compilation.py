@@ -39,9 +39,9 @@ def _compile_run() -> float:
     system, task = CartPole.create(), Balance()
     setup = online.Setup.create(system, default_learner("cartpole", system, task), task)
     target = SimulatedTarget(system, task, jax.numpy.array([0.5, 0.3]))
-    run = jax.jit(lambda key, setup, target: online.run(key, setup, target, rounds=30))
+    run = jax.jit(online.run, static_argnames="rounds", compiler_options=online.COMPILER_OPTIONS)
     start = now()
-    run.lower(jax.random.key(0), setup, target).compile()
+    run.lower(jax.random.key(0), setup, target, rounds=30).compile()
     return now() - start
 
 

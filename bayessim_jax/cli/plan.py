@@ -75,10 +75,11 @@ class Plan:
             return _over_seeds(one, len(self.seeds))(keys, thetas, states)
 
         seen = jax.eval_shape(record, setup, keys.record, thetas, states)
+        build = lambda f, *args: jax.jit(f, compiler_options=online.COMPILER_OPTIONS).lower(*args)  # noqa: E731
         with ThreadPoolExecutor() as pool:  # the two are compiled while the third is traced
-            recorder = pool.submit(jax.jit(record).lower(setup, keys.record, thetas, states).compile)
-            evaluator = pool.submit(jax.jit(evaluate).lower(setup, keys.evaluate, thetas, states).compile)
-            updater = jax.jit(update).lower(setup, keys.update, states, seen).compile()
+            recorder = pool.submit(build(record, setup, keys.record, thetas, states).compile)
+            evaluator = pool.submit(build(evaluate, setup, keys.evaluate, thetas, states).compile)
+            updater = build(update, setup, keys.update, states, seen).compile()
         recorder, evaluator = recorder.result(), evaluator.result()
 
         def advance(states: online.State) -> tuple[online.State, online.RoundInfo]:

@@ -208,8 +208,8 @@ def test_the_command_does_what_the_library_does(tmp_path):
     (tmp_path / "tiny.toml").write_text(TINY)
     assert main(["online", "--config", str(tmp_path / "tiny.toml"), "--out", str(tmp_path / "run"), "--quiet"]) == 0
     plan = tiny_plan()
-    run = jax.jit(lambda key, setup, target: online.run(key, setup, target, rounds=3))
-    _, infos = run(jax.random.key(0), plan.setup, plan.target)
+    run = jax.jit(online.run, static_argnames="rounds", compiler_options=online.COMPILER_OPTIONS)
+    _, infos = run(jax.random.key(0), plan.setup, plan.target, rounds=3)
     with xr.open_datatree(tmp_path / "run" / "posterior.nc", engine="h5netcdf") as tree:
         seen = tree["observed_data"].to_dataset().load()
     x = np.stack([seen[name].values for name in plan.setup.system.observations.names], axis=-1)
