@@ -6,18 +6,18 @@ from collections.abc import Callable
 from typing import Any
 
 import flax.linen as nn
-from jax.nn.initializers import variance_scaling
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 __all__ = ["Mlp"]
 
 
 class Mlp(nn.Module):
-    """Fully connected layers, x ← activation(W x + b), and a linear output; uniform initial weights.
+    """Fully connected layers, x ← activation(W x + b), and a linear output.
 
-    The variance of a weight is gain² · 2 / (inputs + outputs), with a gain of √2 before an activation.
-
-    Source: Glorot and Bengio 2010
+    Initial weights are normal with the variance that an orthogonal matrix has, gain²/max(inputs, outputs), and a gain
+    of √2 before an activation.
     """
 
     widths: tuple[int, ...]
@@ -29,5 +29,9 @@ class Mlp(nn.Module):
     def __call__(self, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
         """Apply the network to the last axis."""
         for width in self.widths:
-            x = self.activation(nn.Dense(width, kernel_init=variance_scaling(2.0, "fan_avg", "uniform"))(x))
-        return nn.Dense(self.outputs, kernel_init=variance_scaling(self.output_gain**2, "fan_avg", "uniform"))(x)
+            x = self.activation(nn.Dense(width, kernel_init=_normal(2**0.5))(x))
+        return nn.Dense(self.outputs, kernel_init=_normal(self.output_gain))(x)
+
+
+def _normal(gain: float) -> Callable[..., Any]:
+    return lambda key, shape, dtype: gain / max(shape) ** 0.5 * jax.random.normal(key, shape, dtype or jnp.float32)
