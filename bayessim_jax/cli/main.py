@@ -22,6 +22,7 @@ commands:
   online SYSTEM   learn a system's parameters and its controller together (bayessim online --help)
   new CASE        make a case folder from a MuJoCo model (bayessim new --help)
   check CASE      print what a case holds and what is wrong with it
+  infer CASE      infer a model's parameters from recordings (bayessim infer --help)
   report RUN      write the report of a run folder again
   systems         what can be identified: parameters, units, priors
 
@@ -30,7 +31,7 @@ options:
   --version       show the version
   --citations     BibTeX of what this package builds on (bayessim --citations RUN: of what that run used)
 """
-COMMANDS = ("online", "new", "check", "report", "systems")
+COMMANDS = ("online", "new", "check", "infer", "report", "systems")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -72,6 +73,10 @@ def _dispatch(words: list[str]) -> int:
         from bayessim_jax.cli.check import check
 
         return check(rest)
+    if first == "infer":
+        from bayessim_jax.cli.infer import infer
+
+        return infer(rest)
     if first == "report":
         from bayessim_jax.cli.report import report
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-__all__ = ["Draws", "read_draws", "read_history", "write_posterior"]
+__all__ = ["ENGINE", "Draws", "read_draws", "read_group", "read_history", "write_posterior"]
 
 ENGINE = "h5netcdf"
 
@@ -89,7 +89,7 @@ class Draws:
 
 def read_draws(path: Path) -> Draws:
     """The group `posterior_rounds`; raises `ValueError` where the file is missing or damaged."""
-    data = _read(path, "posterior_rounds")
+    data = read_group(path, "posterior_rounds")
     variables = list(data.data_vars.values())
     draws = np.stack([v.values[:, 0] for v in variables], axis=-1)
     marks = [v.attrs for v in variables]
@@ -106,7 +106,7 @@ def read_draws(path: Path) -> Draws:
 
 def read_history(path: Path, observations: Box, actions: Box | Discrete) -> History:
     """Read back what `write_posterior` wrote; raises `ValueError` where the file is missing or damaged."""
-    seen = _read(path, "observed_data")
+    seen = read_group(path, "observed_data")
     widen = lambda x: x if "seed" in seen.dims else x[:, None]  # noqa: E731
 
     def stacked(names: Sequence[str], prefix: str = "") -> np.ndarray:
@@ -122,7 +122,8 @@ def read_history(path: Path, observations: Box, actions: Box | Discrete) -> Hist
     )
 
 
-def _read(path: Path, group: str) -> xr.Dataset:
+def read_group(path: Path, group: str) -> xr.Dataset:
+    """One group of the file, in memory; raises `ValueError` where the file is missing or damaged."""
     try:
         with xr.open_dataset(path, group=group, engine=ENGINE) as data:
             return data.load()

@@ -41,19 +41,25 @@ th { font-weight: 600; color: var(--soft); }
 pre { background: var(--card); border-radius: .5rem; padding: .8rem 1rem; overflow-x: auto; margin: .3rem 0 .9rem; }
 code { font: .88rem/1.5 ui-monospace, "SF Mono", Menlo, Consolas, monospace; }
 summary { cursor: pointer; color: var(--soft); margin: .6rem 0; }
+.controls { display: flex; flex-wrap: wrap; gap: .4rem 1rem; align-items: center; margin: 0 0 .6rem; max-width: none; }
+.controls input { flex: 1; min-width: 8rem; }
+.key { font-size: .85rem; color: var(--soft); } .key i { display: inline-block; width: .9rem; height: .3rem;
+  margin-right: .35rem; vertical-align: middle; border-radius: .15rem; }
+canvas { display: block; width: 100%; touch-action: pan-y; }
 footer { margin-top: 3rem; border-top: 1px solid var(--line); padding-top: 1rem; }
 """
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 
-def page(title: str, body: str) -> str:
-    """The whole document; a content policy in its head forbids scripts and any access to the network."""
+def page(title: str, body: str, *, script: str = "", script_hash: str = "") -> str:
+    """The whole document; a content policy in its head forbids any access to the network and every other script."""
+    policy = f"{POLICY}; script-src '{script_hash}'" if script_hash else POLICY
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{CSS}</style>\n</head>\n<body>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
+        f"<title>{escape(title)}</title>\n<style>{CSS}</style>\n</head>\n<body>\n<main>\n{body}\n</main>\n{script}</body>\n</html>\n"
     )
 
 

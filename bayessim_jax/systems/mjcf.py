@@ -71,7 +71,7 @@ class MjcfSystem:
         place, rate = jax.random.split(key)
         move = self.scatter * jax.random.uniform(place, self.scatter.shape, minval=-1.0, maxval=1.0)
         push = self.scatter * jax.random.uniform(rate, self.scatter.shape, minval=-1.0, maxval=1.0)
-        return self.begin(theta, _displace(self.engine.model, self.qpos, move), self.qvel + push)
+        return self.begin(theta, displace(self.engine.model, self.qpos, move), self.qvel + push)
 
     def begin(self, theta: Float[Array, " d"], qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]) -> MjcfState:
         """The state with these positions and velocities, without a control."""
@@ -174,7 +174,7 @@ def _fill(name: str, values: Any, size: int) -> Float[Array, " n"]:
     return jnp.broadcast_to(values, (size,))
 
 
-def _displace(model: mujoco.MjModel, qpos: Float[Array, " nq"], move: Float[Array, " nv"]) -> Float[Array, " nq"]:
+def displace(model: mujoco.MjModel, qpos: Float[Array, " nq"], move: Float[Array, " nv"]) -> Float[Array, " nq"]:
     """Positions moved along every degree of freedom, a turn of a ball or free joint as a rotation vector."""
     pieces, free, ball = [], mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
     for joint in range(model.njnt):

@@ -1,0 +1,112 @@
+"""How well a simulator predicts recordings from which it is restarted: errors, scores, and what noise allows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from bayessim_jax.inference.shooting import Predict, Ridge, Shots
+
+__all__ = ["Errors", "Score", "predict_windows", "prediction_errors", "score", "smallest_error"]
+
+BINS = 8
+"""Stretches of lead time over which the spread of errors is estimated."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """What predictions missed, and where there was something to compare with."""
+
+    error: Float[np.ndarray, "windows rows obs"]
+    measured: Bool[np.ndarray, "windows rows obs"]
+    diverged: int = 0
+    """Windows whose simulation was not finite: counted, and in no average."""
+
+    def take(self, windows: Any) -> Errors:
+        """Some of the windows."""
+        return Errors(self.error[windows], self.measured[windows], self.diverged)
+
+
+@dataclass(frozen=True)
+class Score:
+    """Errors in numbers."""
+
+    nrmse: float
+    """Root mean square error over a channel's standard deviation, averaged over channels."""
+    log_score: float
+    """Mean log density of a measured number under a Gaussian around the prediction, in units of the channel's
+    standard deviation; its spread was estimated on other recordings, for each channel and lead time."""
+    per_channel: dict[str, float]
+    diverged: int = 0
+
+    def as_table(self) -> dict[str, Any]:
+        """The block of `inference.json` and `diagnosis.json`."""
+        return {"nrmse": self.nrmse, "log_score": self.log_score, "per_channel": self.per_channel}
+
+
+def predict_windows(predict: Predict, shots: Shots, z: Float[Array, " d"]) -> Float[np.ndarray, "windows rows obs"]:
+    """Predictions of every window from its recorded initial state."""
+    return np.asarray(_predict(predict, shots.inputs, z, jnp.zeros((shots.y.shape[0], shots.spread.size))))
+
+
+def _predict_all(predict: Predict, inputs: Any, z: Array, delta: Array) -> Array:
+    return jax.vmap(predict, in_axes=(None, 0, 0))(z, delta, inputs)
+
+
+_predict = jax.jit(_predict_all, static_argnums=0)
+
+
+def prediction_errors(predict: Predict, shots: Shots, z: Float[Array, " d"]) -> Errors:
+    """Measured minus predicted in every row after a window's first; windows that diverge are left out and counted."""
+    predicted, y, measured = predict_windows(predict, shots, z), np.asarray(shots.y), np.asarray(shots.measured)
+    lost = ~np.isfinite(np.where(measured, predicted, 0.0)).all((1, 2))
+    measured = measured & ~lost[:, None, None]
+    measured[:, 0] = False
+    return Errors(np.where(measured, y - np.nan_to_num(predicted), 0.0), measured, int(lost.sum()))
+
+
+def score(errors: Errors, reference: Errors, scale: Float[np.ndarray, " obs"], channels: tuple[str, ...]) -> Score:
+    """Score errors; the Gaussian's spread comes from the `reference` errors, made on other recordings.
+
+    `scale` is the standard deviation of every channel.
+    """
+    counts = errors.measured.sum((0, 1))
+    rms = np.sqrt((errors.error**2).sum((0, 1)) / np.maximum(counts, 1))
+    seen = np.flatnonzero(counts > 0)
+    per_channel = {c: float(rms[k] / scale[k]) for k, c in enumerate(channels) if k in seen}
+    logs, total = 0.0, 0
+    for rows in np.array_split(np.arange(errors.error.shape[1]), BINS):
+        for k in seen:
+            mask, known = errors.measured[:, rows, k], reference.measured[:, rows, k]
+            e, r = errors.error[:, rows, k][mask], reference.error[:, rows, k][known]
+            if not e.size:
+                continue
+            variance = ((r**2).mean() if r.size else scale[k] ** 2) / scale[k] ** 2 + 1e-12
+            logs += float((-0.5 * (e / scale[k]) ** 2 / variance - 0.5 * np.log(2 * np.pi * variance)).sum())
+            total += e.size
+    nrmse = float(np.mean(list(per_channel.values()))) if per_channel else float("nan")
+    return Score(nrmse, logs / max(total, 1), per_channel, errors.diverged)
+
+
+def smallest_error(
+    ridge: Ridge, shots: Shots, start: Float[np.ndarray, " n"], scale: Float[np.ndarray, " obs"]
+) -> float:
+    """The nrmse that noise alone leaves at a fit: of the sensors, and of the recorded initial states, propagated.
+
+    Var e = σ² + Σ_j (∂y/∂x_j)² s_j², with s the standard deviation of every coordinate of a recorded initial state.
+    """
+    sigma, spread = np.asarray(ridge.fit.sigma), np.asarray(shots.spread)
+    shape = (ridge.slopes.shape[0], ridge.slopes.shape[1], *shots.y.shape[1:])
+    grown = np.asarray(ridge.slopes).reshape(shape) * (start / spread)[:, None, None]
+    variance = (1 + (grown**2).sum(1)) * sigma**2
+    measured = np.asarray(shots.measured).copy()
+    measured[:, 0] = False
+    counts = measured.sum((0, 1))
+    mean = np.where(measured, variance, 0.0).sum((0, 1)) / np.maximum(counts, 1)
+    each = np.sqrt(mean) / scale
+    return float(each[counts > 0].mean())

@@ -1,0 +1,239 @@
+"""The likelihood of recordings, written down: windows of a deterministic simulator, each with its own start, and noise.
+
+A recording is cut into windows. Window w is simulated from its own initial state x_w, a correction δ_w of the recorded
+one, under the recorded commands; what the sensors show is the prediction plus independent Gaussian noise:
+
+    y_wtc = h_c(x_t(θ, x_w)) + σ_c ε,    z ~ N(m, I) with θ = θ(z) and m = 0,    δ_w ~ N(0, S²)
+
+θ is common to all windows. The least-squares problem in (z, δ₁, …, δ_W) has the shape of an arrow: every δ_w is
+eliminated from the normal equations by itself, so a step costs as much as W small problems. Because the initial states
+are inferred with θ, a wrong initial state is not taken for physics.
+
+Source: Bock 1983 (multiple shooting); Levenberg 1944 and Marquardt 1963 (damping); Nocedal and Wright 2006, chapter 10
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from bayessim_jax.contracts import Scalar
+
+__all__ = ["Curvature", "Fit", "Predict", "Shots", "linearize", "Ridge", "profile", "residuals", "ridge", "solve"]
+
+Predict = Callable[[Float[Array, " d"], Float[Array, " n"], Any], Float[Array, "rows obs"]]
+"""`predict(z, δ, window)`: what the sensors show of one window, in every row."""
+
+
+@struct.dataclass
+class Shots:
+    """Windows of recordings, stacked: what a simulation starts from, and what it is compared with."""
+
+    inputs: Any
+    """Whatever `predict` needs of a window, with a leading axis over windows."""
+    y: Float[Array, "windows rows obs"]
+    measured: Bool[Array, "windows rows obs"]
+    """Numbers that are compared; the rest counts nowhere."""
+    spread: Float[Array, " n"]
+    """Prior standard deviation S of the correction of an initial state, for each of its coordinates."""
+    center: Float[Array, " d"] | float = 0.0
+    """Prior mean of z."""
+    shift: Float[Array, "windows n"] | float = 0.0
+    """Prior mean of δ."""
+
+
+@struct.dataclass
+class Curvature:
+    """The normal equations of all windows at one point, the initial states eliminated one by one."""
+
+    cost: Scalar
+    """½ (Σ residuals² + zᵀz + Σ δᵀS⁻²δ)."""
+    hessian: Float[Array, "d d"]
+    """Of z, with z's prior."""
+    gradient: Float[Array, " d"]
+    own: Float[Array, "windows n n"]
+    """Of every δ_w, with its prior."""
+    cross: Float[Array, "windows n d"]
+    own_gradient: Float[Array, "windows n"]
+
+
+@struct.dataclass
+class Fit:
+    """Where the solver ended."""
+
+    z: Float[Array, " d"]
+    delta: Float[Array, "windows n"]
+    sigma: Float[Array, " obs"]
+    """Noise, in each channel's unit."""
+    precision: Float[Array, "d d"]
+    """Of z with every δ eliminated: the inverse of Laplace's covariance."""
+    cost: Scalar
+    steps: Int[Array, ""]
+    converged: Bool[Array, ""]
+
+
+def residuals(predict: Predict, shots: Shots, z: Array, delta: Array, sigma: Array) -> Float[Array, "windows rows obs"]:
+    """(y − prediction) / σ, zero where nothing was measured; not finite where the simulation is not."""
+    y = jax.vmap(predict, in_axes=(None, 0, 0))(z, delta, shots.inputs)
+    return jnp.where(shots.measured, (shots.y - y) / sigma, 0.0)
+
+
+def expand(
+    predict: Predict, shots: Shots, z: Array, delta: Array, sigma: Array, step: float = 0.0
+) -> tuple[Float[Array, "windows k"], Float[Array, "windows dn k"]]:
+    """Residuals of every window and the derivatives of its predictions along (z, δ/S), both in units of σ.
+
+    Forward-mode derivatives; central differences of length `step` where it is not zero, for simulators that are not
+    differentiable.
+    """
+    d, n = z.size, delta.shape[-1]
+    scale = jnp.concatenate([jnp.ones(d), shots.spread])
+
+    def one(x: Array, inputs: Any, y: Array, measured: Array) -> tuple[Array, Array]:
+        def prediction(x: Array) -> Array:
+            return predict(x[:d], x[d:], inputs)
+
+        along = jnp.diag(scale)
+        if step:
+            ahead, behind = (jax.vmap(lambda m, s=s: prediction(x + s * step * m))(along) for s in (1, -1))
+            value, slopes = prediction(x), (ahead - behind) / (2 * step)
+        else:
+            value = prediction(x)
+            slopes = jax.vmap(lambda m: jax.jvp(prediction, (x,), (m,))[1])(along)
+        r = jnp.where(measured, (y - value) / sigma, 0.0)
+        return r.reshape(-1), jnp.where(measured, slopes / sigma, 0.0).reshape(d + n, -1)
+
+    points = jnp.concatenate([jnp.broadcast_to(z, (delta.shape[0], d)), delta], axis=-1)
+    return jax.vmap(one)(points, shots.inputs, shots.y, shots.measured)
+
+
+def linearize(predict: Predict, shots: Shots, z: Array, delta: Array, sigma: Array, *, step: float = 0.0) -> Curvature:
+    """The normal equations at a point."""
+    d, n = z.size, delta.shape[-1]
+    r, slopes = expand(predict, shots, z, delta, sigma, step)
+    products = jnp.einsum("wik,wjk->wij", slopes, slopes)
+    pulls = jnp.einsum("wik,wk->wi", slopes, r)
+    own, scaled = z - shots.center, (delta - shots.shift) / shots.spread
+    return Curvature(
+        cost=0.5 * ((r**2).sum() + own @ own + (scaled**2).sum()),
+        hessian=products[:, :d, :d].sum(0) + jnp.eye(d),
+        gradient=pulls[:, :d].sum(0) - own,
+        own=products[:, d:, d:] + jnp.eye(n),
+        cross=products[:, d:, :d],
+        own_gradient=pulls[:, d:] - scaled,
+    )
+
+
+def eliminate(c: Curvature, damping: Scalar | float = 0.0) -> tuple[Array, Array, Array, Array]:
+    """Precision of z after the δ are eliminated, its gradient, and per window own⁻¹ cross and own⁻¹ gradient."""
+    n = c.own.shape[-1]
+    own = c.own + damping * jnp.eye(n) * jnp.diagonal(c.own, axis1=-2, axis2=-1)[..., None]
+    solved = jnp.linalg.solve(own, jnp.concatenate([c.cross, c.own_gradient[..., None]], axis=-1))
+    toward, shift = solved[..., :-1], solved[..., -1]
+    precision = c.hessian - jnp.einsum("wni,wnj->ij", c.cross, toward)
+    gradient = c.gradient - jnp.einsum("wni,wn->i", c.cross, shift)
+    return precision, gradient, toward, shift
+
+
+@partial(jax.jit, static_argnames=("predict", "steps", "step"))
+def solve(
+    predict: Predict,
+    shots: Shots,
+    z: Float[Array, " d"],
+    delta: Float[Array, "windows n"],
+    sigma: Float[Array, " obs"],
+    free: Bool[Array, " d"],
+    *,
+    steps: int = 30,
+    step: float = 0.0,
+    tolerance: float = 1e-7,
+    damping: float = 1e-3,
+) -> Fit:
+    """Levenberg-Marquardt on (z, δ₁, …, δ_W) from a starting point; z stays as it is where it is not `free`.
+
+    A step that does not lower the cost, or leads to a number that is not finite, is refused and shortened. The solver
+    has converged when a step that was accepted lowers the cost by less than `tolerance` of it, or when no step does.
+    """
+    kind = jnp.result_type(z)
+    z, delta, sigma = z.astype(kind), delta.astype(kind), sigma.astype(kind)
+
+    def at(z: Array, delta: Array) -> Curvature:
+        return linearize(predict, shots, z, delta, sigma, step=step)
+
+    def body(carry: Any) -> Any:
+        z, delta, here, damping, count, small = carry
+        held = jnp.outer(free, free)
+        precision, gradient, toward, shift = eliminate(here, damping)
+        precision = jnp.where(held, precision, jnp.eye(z.size))
+        precision = precision + damping * jnp.diag(jnp.diagonal(here.hessian))
+        move = jnp.where(free, jnp.linalg.solve(precision, jnp.where(free, gradient, 0.0)), 0.0)
+        move = move * jnp.minimum(1.0, 2.0 / jnp.maximum(jnp.abs(move).max(initial=0.0), 1e-12))
+        moves = (shift - toward @ move) * shots.spread
+        there = at(z + move, delta + moves)
+        sound = jnp.isfinite(there.cost) & jnp.isfinite(there.gradient).all() & jnp.isfinite(there.hessian).all()
+        better = sound & (there.cost <= here.cost)
+        gain = jnp.where(better, (here.cost - there.cost) / jnp.maximum(jnp.abs(here.cost), 1e-12), 1.0)
+        pick = lambda a, b: jax.tree.map(lambda x, y: jnp.where(better, x, y), a, b)  # noqa: E731
+        z, delta, here = pick((z + move, delta + moves, there), (z, delta, here))
+        damping = jnp.where(better, jnp.maximum(damping / 5, 1e-9), damping * 8)
+        small = jnp.where(better & (gain < tolerance), small + 1, jnp.where(better, 0, small))
+        return z, delta, here, damping.astype(kind), count + 1, small
+
+    def more(carry: Any) -> Any:
+        _, _, _, damping, count, small = carry
+        return (count < steps) & (small < 2) & (damping < 1e9)
+
+    start = at(z, delta)
+    z, delta, here, last, count, small = jax.lax.while_loop(
+        more, body, (z, delta, start, jnp.asarray(damping, kind), jnp.array(0), jnp.array(0))
+    )
+    return Fit(
+        z=z,
+        delta=delta,
+        sigma=sigma,
+        precision=eliminate(here)[0],
+        cost=here.cost,
+        steps=count,
+        converged=(small >= 2) | (last >= 1e9),
+    )
+
+
+@struct.dataclass
+class Ridge:
+    """The likelihood around a fit as a function of z alone: how initial states follow z, and what they can absorb."""
+
+    fit: Fit
+    toward: Float[Array, "windows n d"]
+    slopes: Float[Array, "windows n k"]
+    inverse: Float[Array, "windows n n"]
+
+
+@partial(jax.jit, static_argnames=("predict", "step"))
+def ridge(predict: Predict, shots: Shots, fit: Fit, *, step: float = 0.0) -> Ridge:
+    """Linearize the initial states at a fit."""
+    d, n = fit.z.size, fit.delta.shape[-1]
+    toward = eliminate(linearize(predict, shots, fit.z, fit.delta, fit.sigma, step=step))[2]
+    slopes = expand(predict, shots, fit.z, fit.delta, fit.sigma, step)[1][:, d:]
+    return Ridge(fit, toward, slopes, jnp.linalg.inv(jnp.einsum("wik,wjk->wij", slopes, slopes) + jnp.eye(n)))
+
+
+def profile(predict: Predict, shots: Shots, ridge: Ridge, z: Float[Array, " d"]) -> Scalar:
+    """Log p(y, z) up to a constant, every initial state integrated out as in a linear model.
+
+    δ follows z along the arrow that the fit found, δ(z) = δ̂ − own⁻¹ cross (z − ẑ), and what the residuals there still
+    have along ∂y/∂δ at the fit is taken out exactly: one simulation of every window.
+    """
+    fit = ridge.fit
+    delta = fit.delta - (ridge.toward @ (z - fit.z)) * shots.spread
+    r = residuals(predict, shots, z, delta, fit.sigma)
+    flat, scaled = r.reshape(r.shape[0], -1), (delta - shots.shift) / shots.spread
+    pull = jnp.einsum("wnk,wk->wn", ridge.slopes, flat) - scaled
+    left = (flat**2).sum() + (scaled**2).sum() - jnp.einsum("wn,wnm,wm->", pull, ridge.inverse, pull)
+    log = -0.5 * (left + (z - shots.center) @ (z - shots.center))
+    return jnp.where(jnp.isfinite(log), log, -jnp.inf)

@@ -1,0 +1,190 @@
+"""From a case to what was learned of its parameters: fit, posterior, predictions before and after, identifiability."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from bayessim_jax.inference.direct import DirectPosterior, fit_direct, sample_direct
+from bayessim_jax.inference.identifiability import Identifiability, find_unidentified
+from bayessim_jax.inference.scores import Score, predict_windows, prediction_errors, score, smallest_error
+from bayessim_jax.inference.shooting import Fit, Shots, ridge
+from bayessim_jax.recordings.shots import CaseModel, case_model, predictor, split_windows
+from bayessim_jax.recordings.windows import Windows
+
+__all__ = ["CaseInference", "channel_scale", "infer_case", "settle_step", "start_spread"]
+
+DRAWS = 2000
+BAND = 24
+"""Posterior draws whose predictions make the band around the recording."""
+
+
+@dataclass(frozen=True)
+class CaseInference:
+    """A posterior over a case's parameters, and how the simulator predicts with it and without it."""
+
+    model: CaseModel
+    posterior: DirectPosterior
+    fitted: Windows
+    """Windows that the posterior is of."""
+    held_out: Windows
+    """Windows that were not used; scores and figures are of these."""
+    predictions: dict[str, Float[np.ndarray, "windows rows obs"]]
+    """Of the held-out windows: `baseline` at the prior's mean, `posterior` at the posterior's."""
+    band: Float[np.ndarray, "draws windows rows obs"]
+    """Predictions of the held-out windows at draws of the posterior."""
+    scores: dict[str, Score]
+    noise_floor: float
+    identifiability: Identifiability
+
+    @property
+    def held_out_names(self) -> list[str]:
+        """Recordings none of whose windows were used; windows of a recording that was split are named by its file."""
+        return sorted({self.model.recordings[i].name for i in self.held_out.recording})
+
+    def table(self) -> dict[str, Any]:
+        """What `inference.json` holds."""
+        draws, margins = np.asarray(self.posterior.draws), self.model.margins
+        quantiles = np.quantile(draws, [0.05, 0.5, 0.95], axis=0)
+        priors = [str(p.prior) for p in self.model.case.parameters]
+        parameters = {
+            name: {
+                "mean": float(draws[:, k].mean()),
+                "sd": float(draws[:, k].std()),
+                "q05": float(quantiles[0, k]),
+                "median": float(quantiles[1, k]),
+                "q95": float(quantiles[2, k]),
+                "unit": margins.units[k],
+                "prior": priors[k],
+            }
+            for k, name in enumerate(margins.names)
+        }
+        noise = dict(zip(self.model.channels, np.asarray(self.posterior.fit.sigma).tolist(), strict=True))
+        return {
+            "schema": 1,
+            "case": self.model.case.case.name,
+            "parameters": parameters,
+            "noise": noise,
+            "fit": {
+                "horizon": self.model.case.case.horizon,
+                "held_out": self.held_out_names,
+                **{name: s.as_table() for name, s in self.scores.items()},
+                "noise_floor": self.noise_floor,
+                "windows": {"fitted": len(self.fitted), "held_out": len(self.held_out)},
+                "diverged": max(s.diverged for s in self.scores.values()),
+            },
+            "identifiability": self.identifiability.as_table(),
+            "engine": {"name": self.model.system.engine.name, "reason": self.model.system.reason},
+            "sampler": self.posterior.sampler,
+        }
+
+
+def start_spread(model: CaseModel, fit: Fit) -> Float[np.ndarray, " n"]:
+    """How far recorded initial states are off: their own noise where they were measured, else what the fit found."""
+    moved = np.asarray(fit.delta)
+    found = 1.4826 * np.median(np.abs(moved), axis=0)
+    joints, nv = model.case.layout.joints, model.system.engine.model.nv
+    sigma = dict(zip(model.channels, np.asarray(fit.sigma), strict=True))
+    names = {v: (f"joint/{name}/qpos", f"joint/{name}/qvel") for name, kind, _, v in joints if kind in (2, 3)}
+    for v, (place, rate) in names.items():
+        if place in sigma:
+            found[v] = sigma[place]
+        if rate in sigma:
+            found[nv + v] = sigma[rate]
+    return found
+
+
+def infer_case(
+    key: Array,
+    model: CaseModel,
+    *,
+    exact: bool = True,
+    draws: int = DRAWS,
+    say: Callable[[str], None] = lambda text: None,
+) -> CaseInference:
+    """Infer a case's parameters by their likelihood; raises `ValueError` where nothing can be simulated.
+
+    Windows of held-out recordings (of held-out stretches, where there is one recording) take no part in the fit.
+    """
+    fit_key, draw_key = jax.random.split(key)
+    fitted, held = split_windows(model)
+    say(f"fitting {len(fitted)} windows of {model.case.case.horizon:g} s; {len(held)} are kept to judge by")
+    model, fit = settle_step(fit_key, model, fitted, say=say)
+    predict, shots, left = predictor(model), model.shots(fitted), model.shots(held)
+    say("sampling the posterior")
+    posterior = sample_direct(draw_key, predict, shots, model.margins, fit, draws=draws, step=model.step, exact=exact)
+    say("predicting held-out windows")
+    prior_mean = jnp.asarray([p.prior.mean for p in model.case.parameters])
+    points = {"baseline": model.margins.standard(prior_mean), "posterior": posterior.z.mean(0)}
+    scale = channel_scale(shots, left)
+    scores, predictions = {}, {}
+    for name, z in points.items():
+        predictions[name] = predict_windows(predict, left, z)
+        reference = prediction_errors(predict, shots, z)
+        scores[name] = score(prediction_errors(predict, left, z), reference, scale, model.channels)
+    band = np.stack([predict_windows(predict, left, z) for z in posterior.z[:: max(draws // BAND, 1)][:BAND]])
+    around = ridge(predict, shots, fit, step=model.step)
+    return CaseInference(
+        model=model,
+        posterior=posterior,
+        fitted=fitted,
+        held_out=held,
+        predictions=predictions,
+        band=band,
+        scores=scores,
+        noise_floor=smallest_error(around, shots, start_spread(model, fit), scale),
+        identifiability=find_unidentified(np.asarray(posterior.z), model.margins.names),
+    )
+
+
+def settle_step(
+    key: Array, model: CaseModel, windows: Windows, *, say: Callable[[str], None] = lambda text: None
+) -> tuple[CaseModel, Fit]:
+    """Fit a case, on the model's own time step or, where that explains the recordings better, on a finer one.
+
+    An integration error looks like missing physics. Where the error of the model's time step is of the size of the
+    noise, the fit is repeated with a quarter of it, and the one that leaves less noise is kept.
+    """
+    predict, shots = predictor(model), model.shots(windows)
+    fit = fit_direct(key, predict, shots, model.margins.size, step=model.step, say=say)
+    finer = case_model(
+        model.case, engine=model.system.engine.name, before=model.before, refined=REFINED * model.refined
+    )
+    coarse = _simulated(predict, shots.inputs, fit.z, fit.delta)
+    fine = _simulated(predictor(finer), shots.inputs, fit.z, fit.delta)
+    error = np.where(np.asarray(shots.measured), np.asarray(coarse - fine) / np.asarray(fit.sigma), 0.0)
+    size = float(np.sqrt((error**2).sum((0, 1)) / np.maximum(np.asarray(shots.measured).sum((0, 1)), 1)).max())
+    if not size > NEGLIGIBLE:
+        return model, fit
+    again = fit_direct(key, predictor(finer), shots, model.margins.size, start=fit, step=model.step, say=say)
+    gain = float((np.log(np.asarray(fit.sigma) / np.asarray(again.sigma))).mean())
+    h = model.system.dt / model.system.substeps
+    if gain <= 0.01:
+        return model, fit
+    remark = f"time step {h / REFINED:g} s instead of {h:g} s: the integration error is {size:.1f} times the noise"
+    say(remark)
+    return dataclasses.replace(finer, remarks=(*finer.remarks, remark)), again
+
+
+_simulated = jax.jit(
+    lambda predict, inputs, z, delta: jax.vmap(predict, in_axes=(None, 0, 0))(z, delta, inputs), static_argnums=0
+)
+REFINED = 4
+NEGLIGIBLE = 0.3
+"""Of the noise: an integration error that is smaller changes nothing."""
+
+
+def channel_scale(*shots: Shots) -> Float[np.ndarray, " obs"]:
+    """Standard deviation of every channel over all rows that are compared."""
+    columns = []
+    for k in range(shots[0].y.shape[-1]):
+        values = np.concatenate([np.asarray(s.y)[..., k][np.asarray(s.measured)[..., k]] for s in shots])
+        columns.append(max(float(values.std()), 1e-12) if values.size else 1.0)
+    return np.array(columns)

@@ -1,0 +1,108 @@
+"""What an inference on a case leaves behind: `inference.json`, `posterior.nc`, the model with the posterior's mean."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Float
+
+from bayessim_jax import __version__
+from bayessim_jax.recordings.files import replace_file, to_json, write_text
+from bayessim_jax.recordings.loading import LoadedCase, load_case
+from bayessim_jax.recordings.mjcf import referenced_files
+from bayessim_jax.recordings.posterior import ENGINE, read_group
+from bayessim_jax.recordings.run_folder import RunFolder
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from bayessim_jax.recordings.identification import CaseInference
+
+__all__ = ["sample_models", "write_inference", "write_model"]
+
+PRIOR_DRAWS = 2000
+
+
+def write_inference(folder: RunFolder, result: CaseInference, seed: int) -> None:
+    """Write everything but the report into a run folder."""
+    write_text(folder.path / "inference.json", to_json(result.table(), indent=2) + "\n")
+    _write_posterior(folder.path / "posterior.nc", result, seed)
+    means = dict(zip(result.model.margins.names, np.asarray(result.posterior.draws).mean(0).tolist(), strict=True))
+    write_model(folder.path / "model_posterior.xml", result.model.case, means)
+
+
+def write_model(path: Path, case: LoadedCase, values: Mapping[str, float]) -> None:
+    """Write a case's model with values put in, and the files that it refers to beside it, so that MuJoCo loads it."""
+    spec, _ = case.augmented(values)
+    source = case.case.folder / case.case.model
+    for file in referenced_files(source, case.case.folder):
+        if file.suffix.lower() not in (".xml", ".mjcf"):
+            place = path.parent / file.resolve().relative_to(source.parent.resolve())
+            place.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, place)
+    write_text(path, spec.to_xml())
+
+
+def _write_posterior(path: Path, result: CaseInference, seed: int) -> None:
+    """Groups `prior`, `posterior`, and of held-out windows `observed_data` and `posterior_predictive`, as in ArviZ."""
+    model = result.model
+    margins, channels = model.margins, model.channels
+    rng = np.random.default_rng(seed)
+    prior = np.stack([p.prior.quantile(rng.uniform(size=PRIOR_DRAWS)) for p in model.case.parameters], axis=-1)
+
+    def named(x: Float[np.ndarray, "draw d"]) -> dict[str, Any]:
+        facts = zip(margins.names, margins.units, model.case.parameters, strict=True)
+        return {
+            name: (("chain", "draw"), x[None, :, k], {"units": unit, "prior": str(p.prior), **_bounds(p.prior)})
+            for k, (name, unit, p) in enumerate(facts)
+        }
+
+    windows, units = result.held_out, model.case.layout.units
+    y = np.asarray(model.shots(windows).y)
+    measured = np.asarray(model.shots(windows).measured)
+    seen = np.where(measured, y, np.nan)
+    rows = ("window", "row")
+    dotted = [c.replace("/", ".") for c in channels]  # netCDF keeps the slash for groups
+    observed: dict[str, Any] = {dotted[k]: (rows, seen[..., k], {"units": units[c]}) for k, c in enumerate(channels)}
+    observed["time"] = (rows, windows.start[:, None] + windows.time, {"units": "s"})
+    observed["recording"] = (("window",), [model.recordings[i].name for i in windows.recording])
+    predicted = {
+        dotted[k]: (("chain", "draw", *rows), result.band[None, ..., k], {"units": units[c]})
+        for k, c in enumerate(channels)
+    }
+    groups = {
+        "prior": xr.Dataset(named(prior)),
+        "posterior": xr.Dataset(named(np.asarray(result.posterior.draws))),
+        "posterior_predictive": xr.Dataset(predicted),
+        "observed_data": xr.Dataset(observed),
+    }
+    attributes = {
+        "title": f"Parameters of {model.case.case.name}",
+        "inference_library": "bayessim_jax",
+        "inference_library_version": __version__,
+    }
+    tree = xr.DataTree.from_dict({"/": xr.Dataset(attrs=attributes), **groups})
+    replace_file(path, lambda temporary: tree.to_netcdf(temporary, engine=ENGINE))
+
+
+def _bounds(prior: Any) -> dict[str, float]:
+    return {"prior_low": float(prior.low), "prior_high": float(prior.high)}
+
+
+def sample_models(run: str | Path, n: int, *, seed: int = 0) -> list[Any]:
+    """Draw `n` MuJoCo models from a run's posterior, for domain randomization elsewhere.
+
+    `run` is a folder that `bayessim infer` wrote; its case has to be where it was. Returns compiled `mujoco.MjModel`,
+    derived quantities included. Raises `ValueError` where a file is missing or damaged.
+    """
+    folder = RunFolder.open(Path(run))
+    case = load_case(Path(folder.read_config()["case"])).check()
+    group = read_group(folder.path / "posterior.nc", "posterior")
+    names = [p.name for p in case.parameters]
+    draws = np.stack([group[name].values.reshape(-1) for name in names], axis=-1)
+    picks = np.random.default_rng(seed).choice(len(draws), n, replace=n > len(draws))
+    return [case.augmented(dict(zip(names, row.tolist(), strict=True)))[1] for row in draws[picks]]

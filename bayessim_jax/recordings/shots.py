@@ -1,0 +1,224 @@
+"""From a case to windows that a simulator can be compared with: the system, its predictions, and what is held out."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+from bayessim_jax.beliefs.margins import Margin, Margins, log_normal, normal, uniform
+from bayessim_jax.inference.shooting import Shots
+from bayessim_jax.recordings.priors import LogNormal, Normal, Prior
+from bayessim_jax.recordings.recording import CaseRecording, resample
+from bayessim_jax.recordings.windows import Windows, stack_windows
+from bayessim_jax.systems.mjcf import MjcfSystem, Unknown, displace, mjcf_system
+
+if TYPE_CHECKING:
+    from bayessim_jax.recordings.loading import LoadedCase
+
+__all__ = ["CaseModel", "Inputs", "case_model", "margin_of", "margins_of", "predictor", "split_windows", "take"]
+
+JITTER = 0.02
+"""Share of a step by which rows may lie off a uniform grid before a recording is put on one."""
+
+
+@struct.dataclass
+class Inputs:
+    """What the simulation of one window needs."""
+
+    qpos: Float[Array, " nq"]
+    qvel: Float[Array, " nv"]
+    ctrl: Float[Array, "steps nu"]
+    past: Float[Array, "before nu"]
+    """Commands of the rows before the window, the last one just before it."""
+    time: Float[Array, ""]
+    """When the window begins, s in its recording."""
+
+
+def margins_of(case: LoadedCase) -> Margins:
+    """The case's priors."""
+    each = [margin_of(p.prior) for p in case.parameters]
+    return Margins.create([p.name for p in case.parameters], each, [p.unit for p in case.parameters])
+
+
+def margin_of(prior: Prior) -> Margin:
+    """The same belief as a map from a standard normal variable."""
+    if isinstance(prior, LogNormal):
+        return log_normal(prior.log_mean, prior.log_sd)
+    if isinstance(prior, Normal):
+        return normal(prior.loc, prior.scale, prior.low, prior.high)
+    return uniform(prior.low, prior.high)
+
+
+@dataclass(frozen=True, eq=False)
+class CaseModel:
+    """A case ready to be compared: its system, its recordings on the system's time grid, and its channels."""
+
+    case: LoadedCase
+    system: MjcfSystem
+    margins: Margins
+    recordings: tuple[CaseRecording, ...]
+    channels: tuple[str, ...]
+    """Measured channels, in the order of the predictions."""
+    remarks: tuple[str, ...] = ()
+    before: int = 0
+    """Rows of commands before a window that are kept."""
+    refined: int = 1
+    """Time steps of the simulation in one of the model's own."""
+
+    @property
+    def step(self) -> float:
+        """Length of the differences that stand for derivatives; 0 where the engine is differentiable."""
+        return 0.0 if self.system.engine.name in ("tree", "mjx") else 1e-3
+
+    def windows(self, which: Sequence[int], horizon: float | None = None, stride: float | None = None) -> Windows:
+        """Windows of some of the recordings; `recording` numbers them among all."""
+        windows = stack_windows([self.recordings[i] for i in which], horizon or self.case.case.horizon, stride)
+        return dataclasses.replace(windows, recording=np.asarray(which)[windows.recording])
+
+    def shots(self, windows: Windows) -> Shots:
+        """Windows as the solver takes them."""
+        return Shots(
+            inputs=self.inputs(windows),
+            y=jnp.asarray(self._stack(windows.qpos, windows.qvel, windows.sensors)),
+            measured=jnp.asarray(
+                self._stack(windows.qpos_measured, windows.qvel_measured, windows.sensors_measured).astype(bool)
+                & _rows(windows)[..., None]
+            ),
+            spread=jnp.asarray(self._spread()),
+        )
+
+    def inputs(self, windows: Windows) -> Inputs:
+        """Initial states and commands."""
+        past = np.zeros((len(windows), self.before, windows.ctrl.shape[-1]))
+        for w in range(len(windows)):
+            recording = self.recordings[windows.recording[w]]
+            row = int(np.argmin(np.abs(recording.time - windows.start[w])))
+            if self.before:
+                rows = np.maximum(np.arange(row - self.before, row), 0)
+                past[w] = recording.ctrl[rows]
+        return Inputs(*map(jnp.asarray, (windows.qpos[:, 0], windows.qvel[:, 0], windows.ctrl, past, windows.start)))
+
+    def _stack(self, qpos: np.ndarray, qvel: np.ndarray, sensors: np.ndarray) -> np.ndarray:
+        layout = self.case.layout
+        names = (*layout.qpos, *layout.qvel, *layout.sensors)
+        every = np.concatenate([qpos, qvel, sensors], axis=-1)
+        return every[..., [names.index(name) for name in self.channels]]
+
+    def _spread(self) -> np.ndarray:
+        """How far initial states may be off: as far as the recordings move at all."""
+        nv = self.system.engine.model.nv
+        qvel = np.concatenate([r.qvel for r in self.recordings])
+        step = np.concatenate([_motions(self.system.engine.model, r.qpos) for r in self.recordings])
+        place = np.maximum(np.abs(step).std(0) + np.abs(step).mean(0), 1e-3) if len(step) else np.ones(nv)
+        return np.concatenate([place, np.maximum(qvel.std(0), 1e-2)])
+
+
+def _motions(model: Any, qpos: np.ndarray) -> np.ndarray:
+    """Moves along every degree of freedom from the middle of a recording."""
+    import mujoco
+
+    out = np.zeros((len(qpos), model.nv))
+    for row in range(0, len(qpos), max(len(qpos) // 200, 1)):
+        mujoco.mj_differentiatePos(model, out[row], 1.0, qpos[len(qpos) // 2], qpos[row])
+    return out[:: max(len(qpos) // 200, 1)]
+
+
+def _rows(windows: Windows) -> Bool[np.ndarray, "windows rows"]:
+    """Rows that a window has."""
+    first = np.ones((len(windows), 1), bool)
+    return np.concatenate([first, windows.valid], axis=1)
+
+
+def case_model(case: LoadedCase, *, engine: str = "auto", before: int = 0, refined: int = 1) -> CaseModel:
+    """Make a case's system, on a time step that its recordings' rows are a whole number of steps apart.
+
+    With `refined` the simulation takes so many steps for one of the model's. Recordings whose rows are not evenly
+    spaced, or at another rate than the others, are put on a uniform grid. Raises `ValueError` for what the engine does
+    not take.
+    """
+    if case.model is None:
+        raise ValueError(f"system {case.case.system} has no recordings' windows yet; give the model as MJCF.")
+    dt = float(np.median([r.step for r in case.recordings]))
+    remarks, recordings = [], []
+    for recording in case.recordings:
+        steps = np.diff(recording.time)[recording.valid]
+        if np.abs(steps / dt - 1).max() > JITTER:
+            recordings.append(resample(recording, dt))
+            remarks.append(f"{recording.name} is put on a grid of {dt:g} s")
+        else:
+            recordings.append(recording)
+    spec = case.spec.copy()
+    substeps = max(round(dt / spec.option.timestep), 1)
+    if abs(substeps * spec.option.timestep / dt - 1) > 1e-3:
+        substeps = max(int(np.ceil(dt / spec.option.timestep * (1 - 1e-3))), 1)
+        remarks.append(f"time step {dt / substeps:g} s instead of {spec.option.timestep:g} s, {substeps} to a row")
+    substeps *= refined
+    spec.option.timestep = dt / substeps
+    layout = case.layout
+    measured = {
+        name
+        for names, mask in (
+            (layout.qpos, "qpos_measured"),
+            (layout.qvel, "qvel_measured"),
+            (layout.sensors, "sensors_measured"),
+        )
+        for i, name in enumerate(names)
+        if any(getattr(r, mask)[:, i].any() for r in recordings)
+    }
+    channels = tuple(c for c in (*layout.qpos, *layout.qvel, *layout.sensors) if c in measured)
+    unknowns = [Unknown(p.name, tuple(str(t) for t in p.targets), *_bounds(p.prior), p.unit) for p in case.parameters]
+    system = mjcf_system(spec, unknowns, observe=channels, substeps=substeps, engine=engine)
+    return CaseModel(case, system, margins_of(case), tuple(recordings), channels, tuple(remarks), before, refined)
+
+
+def _bounds(prior: Prior) -> tuple[float, float]:
+    low = prior.low if np.isfinite(prior.low) else prior.mean - 5 * prior.sd
+    high = prior.high if np.isfinite(prior.high) else prior.mean + 5 * prior.sd
+    return float(low), float(high)
+
+
+def predictor(model: CaseModel) -> Callable[[Array, Array, Inputs], Array]:
+    """`predict(z, δ, window)` of a case: what its sensors show in every row of a window."""
+    system, margins, mujoco_model = model.system, model.margins, model.system.engine.model
+    nv = mujoco_model.nv
+
+    def predict(z: Array, delta: Array, window: Inputs) -> Array:
+        theta = margins.theta(z)
+        qpos = displace(mujoco_model, window.qpos, delta[:nv])
+        state = system.begin(theta, qpos, window.qvel + delta[nv:])
+        if window.ctrl.shape[-1]:
+            state = dataclasses.replace(state, ctrl=window.ctrl[0])
+        after = system.replay(theta, state, window.ctrl)
+        first = system.observe(theta, state)
+        return jnp.concatenate([first[None], jax.vmap(system.observe, in_axes=(None, 0))(theta, after)])
+
+    return predict
+
+
+def split_windows(model: CaseModel) -> tuple[Windows, Windows]:
+    """Windows to fit and windows to judge by: of whole recordings left out, or of every fourth window of the one.
+
+    About a quarter of the recordings is left out, spread over the list; those without a window count for neither.
+    """
+    every = model.windows(range(len(model.recordings)))
+    present = sorted(set(every.recording.tolist()))
+    units = every.recording if len(present) > 1 else np.arange(len(every))
+    labels = sorted(set(units.tolist()))
+    if len(labels) < 2:
+        return every, every
+    period = max(round(len(labels) / max(round(len(labels) / 4), 1)), 2)
+    held = np.isin(units, labels[period - 1 :: period])
+    return take(every, ~held), take(every, held)
+
+
+def take(windows: Windows, which: Any) -> Windows:
+    """Some of the windows."""
+    return Windows(**{f.name: getattr(windows, f.name)[which] for f in dataclasses.fields(windows)})

@@ -1,0 +1,70 @@
+"""`bayessim infer` as a person runs it."""
+
+import json
+
+import mujoco
+import numpy as np
+import pytest
+import xarray as xr
+
+from bayessim_jax.cli.main import main
+from bayessim_jax.recordings.results import sample_models
+from benchmarks.worlds import make_case
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("infer")
+    truth = make_case(folder / "rig", "slide", seed=2, recordings=3, seconds=2.0)
+    assert main(["infer", str(folder / "rig"), "--out", str(folder / "run"), "--quiet"]) == 0
+    return folder, truth
+
+
+def test_the_run_folder_holds_what_was_learned(run):
+    folder, truth = run
+    table = json.loads((folder / "run" / "inference.json").read_text())
+    mass = table["parameters"]["mass"]
+    assert mass["q05"] < mass["mean"] < mass["q95"]
+    assert mass["mean"] == pytest.approx(truth["mass"], abs=6 * mass["sd"])
+    assert table["fit"]["posterior"]["nrmse"] < table["fit"]["baseline"]["nrmse"]
+    assert set(table["fit"]["posterior"]["per_channel"]) == {"joint/rail/qpos", "joint/rail/qvel"}
+    assert table["fit"]["held_out"] and table["identifiability"]["not_informed"] == []
+    facts = json.loads((folder / "run" / "run.json").read_text())
+    assert facts["status"] == "finished" and facts["seconds"] > 0
+    with xr.open_datatree(folder / "run" / "posterior.nc", engine="h5netcdf") as tree:
+        draws = tree["posterior"]["mass"].values
+        assert draws.shape == (1, 2000)
+        assert tree["posterior"]["mass"].attrs["units"] == "kg"
+        assert draws.mean() == pytest.approx(mass["mean"], rel=1e-6)
+        assert {"prior", "posterior", "posterior_predictive", "observed_data"} <= set(tree.children)
+
+
+def test_the_model_comes_out_with_the_mean_in_it(run):
+    folder, _ = run
+    mean = json.loads((folder / "run" / "inference.json").read_text())["parameters"]["mass"]["mean"]
+    model = mujoco.MjModel.from_xml_path(str(folder / "run" / "model_posterior.xml"))
+    assert model.body("carriage").mass[0] == pytest.approx(mean, rel=1e-4)  # MuJoCo writes six digits
+    models = sample_models(folder / "run", 5, seed=1)
+    masses = [m.body("carriage").mass[0] for m in models]
+    assert len(set(masses)) == 5
+    assert np.mean(masses) == pytest.approx(mean, rel=0.01)
+
+
+def test_a_used_folder_and_slips_are_refused_in_one_line(run, capsys):
+    folder, _ = run
+    before = (folder / "run" / "inference.json").read_bytes()
+    assert main(["infer", str(folder / "rig"), "--out", str(folder / "run")]) == 2
+    assert (folder / "run" / "inference.json").read_bytes() == before
+    assert main(["infer", str(folder / "rig"), "--metod", "direct"]) == 2
+    assert main(["infer", str(folder / "nowhere")]) == 2
+    assert main(["infer", str(folder / "rig"), "--draws", "3", "--out", str(folder / "other")]) == 2
+    told = capsys.readouterr().err.strip().splitlines()
+    assert len(told) == 4
+    assert "already used" in told[0] and "--method" in told[1] and not (folder / "other").exists()
+
+
+def test_the_report_is_one_page_that_shows_everything(run):
+    folder, _ = run
+    page = (folder / "run" / "report.html").read_text()
+    assert "mass is" in page and page.count("<canvas") == 2 and page.count("<svg") >= 3
+    assert "http" not in page.replace("http://www.w3.org", "").replace("http-equiv", "")

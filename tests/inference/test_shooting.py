@@ -1,0 +1,153 @@
+"""Multiple shooting on simulators whose posterior has a closed form."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bayessim_jax.beliefs.margins import Margins, normal
+from bayessim_jax.inference.direct import fit_direct, noise_floor, sample_direct
+from bayessim_jax.inference.shooting import Shots, eliminate, linearize, profile, ridge, solve
+
+WINDOWS, ROWS = 6, 12
+SIGMA = 0.3
+
+
+@pytest.fixture(autouse=True)
+def in_double_precision():
+    jax.config.update("jax_enable_x64", True)
+    yield
+    jax.config.update("jax_enable_x64", False)
+
+
+def line(z, delta, window):
+    """y_t = (x0 + δ) + z₀ t + z₁ t²: linear in everything."""
+    t = jnp.linspace(0.0, 1.0, ROWS)
+    return (window + delta[0] + z[0] * t + z[1] * t**2)[:, None]
+
+
+def line_data(seed=0, sigma=SIGMA):
+    rng = np.random.default_rng(seed)
+    starts, z = rng.normal(size=WINDOWS), rng.normal(size=2)
+    t = np.linspace(0.0, 1.0, ROWS)
+    y = starts[:, None] + 0.2 * rng.normal(size=(WINDOWS, 1)) + z[0] * t + z[1] * t**2
+    y = y[..., None] + sigma * rng.normal(size=(WINDOWS, ROWS, 1))
+    measured = rng.uniform(size=y.shape) > 0.2
+    return Shots(jnp.asarray(starts), jnp.asarray(y), jnp.asarray(measured), jnp.array([0.5])), z
+
+
+def exact(shots, sigma):
+    """Mean and covariance of z by writing the whole Gaussian down."""
+    t = np.linspace(0.0, 1.0, ROWS)
+    size = 2 + WINDOWS
+    precision, right = np.eye(size), np.zeros(size)
+    for k in range(WINDOWS):
+        precision[2 + k, 2 + k] = 1 / 0.5**2
+    for w in range(WINDOWS):
+        for r in range(ROWS):
+            if shots.measured[w, r, 0]:
+                row = np.zeros(size)
+                row[:2], row[2 + w] = [t[r], t[r] ** 2], 1.0
+                precision += np.outer(row, row) / sigma**2
+                right += row * float(shots.y[w, r, 0] - shots.inputs[w]) / sigma**2
+    covariance = np.linalg.inv(precision)
+    return (covariance @ right)[:2], covariance[:2, :2]
+
+
+def solved(predict, shots, **options):
+    sigma = jnp.array([SIGMA])
+    return solve(predict, shots, jnp.zeros(2), jnp.zeros((WINDOWS, 1)), sigma, jnp.ones(2, bool), **options)
+
+
+@pytest.mark.parametrize("step", [0.0, 1e-3])
+def test_a_linear_simulator_has_the_posterior_that_algebra_gives(step):
+    shots, _ = line_data()
+    fit = solved(line, shots, step=step)
+    mean, covariance = exact(shots, SIGMA)
+    assert bool(fit.converged)
+    np.testing.assert_allclose(fit.z, mean, atol=1e-6)
+    np.testing.assert_allclose(jnp.linalg.inv(fit.precision), covariance, rtol=1e-5)
+
+
+def test_the_profile_of_a_linear_simulator_is_its_log_posterior():
+    shots, _ = line_data(1)
+    around = ridge(line, shots, solved(line, shots))
+    mean, covariance = exact(shots, SIGMA)
+    points = np.random.default_rng(0).normal(size=(5, 2)) + mean
+    logs = np.array([profile(line, shots, around, jnp.asarray(p)) for p in points])
+    wanted = np.array([-0.5 * (p - mean) @ np.linalg.solve(covariance, p - mean) for p in points])
+    np.testing.assert_allclose(logs - logs[0], wanted - wanted[0], rtol=1e-6)
+
+
+def test_draws_have_the_posteriors_moments_and_the_noise_is_found():
+    shots, _ = line_data(2)
+    margins = Margins.create(["a", "b"], [normal(0, 1), normal(0, 1)])
+    fit = fit_direct(jax.random.key(0), line, shots, 2)
+    assert float(fit.sigma[0]) == pytest.approx(SIGMA, rel=0.25)
+    posterior = sample_direct(jax.random.key(1), line, shots, margins, fit)
+    mean, covariance = exact(shots, float(fit.sigma[0]))
+    assert posterior.efficiency > 0.7
+    np.testing.assert_allclose(posterior.draws.mean(0), mean, atol=0.15 * np.sqrt(np.diag(covariance)).max())
+    np.testing.assert_allclose(np.cov(posterior.draws, rowvar=False), covariance, rtol=0.35)
+
+
+def banana(z, delta, window):
+    """y = z₁ + 4 z₀²: a curved ridge that no Gaussian describes."""
+    return jnp.full((ROWS, 1), z[1] + 4.0 * z[0] ** 2) + 0.0 * delta[0] + 0.0 * window
+
+
+def test_a_bent_ridge_is_walked():
+    shots = Shots(
+        jnp.zeros(WINDOWS), jnp.full((WINDOWS, ROWS, 1), 1.0), jnp.ones((WINDOWS, ROWS, 1), bool), jnp.ones(1)
+    )
+    margins = Margins.create(["a", "b"], [normal(0, 1), normal(0, 1)])
+    posterior = sample_direct(jax.random.key(0), banana, shots, margins, solved(banana, shots))
+    assert "profile" in posterior.sampler
+    level = posterior.z[:, 1] + 4 * posterior.z[:, 0] ** 2
+    assert float(jnp.abs(level - 1).mean()) < 0.1
+    grid = np.linspace(-3, 3, 4001)
+    weight = np.exp(-0.5 * (grid**2 + (1 - 4 * grid**2) ** 2))
+    assert float(posterior.z[:, 0].std()) == pytest.approx(np.sqrt((weight * grid**2).sum() / weight.sum()), rel=0.15)
+
+
+def fragile(z, delta, window):
+    """Not finite beyond z₀ = 0.5, as a simulation that diverges."""
+    y = line(z, delta, window)
+    return jnp.where(z[0] > 0.5, jnp.nan, y)
+
+
+def test_a_step_into_a_divergence_is_refused():
+    shots, _ = line_data(3)
+    shots = shots.replace(y=shots.y + 3.0 * jnp.linspace(0, 1, ROWS)[:, None])
+    fit = solved(fragile, shots)
+    assert bool(jnp.isfinite(fit.cost))
+    assert float(fit.z[0]) <= 0.5
+
+
+def test_parameters_that_are_not_free_stay():
+    shots, _ = line_data(4)
+    start = jnp.array([0.3, -0.2])
+    free = jnp.array([True, False])
+    fit = solve(line, shots, start, jnp.zeros((WINDOWS, 1)), jnp.array([SIGMA]), free)
+    assert float(fit.z[1]) == -0.2
+    assert float(fit.z[0]) != 0.3
+
+
+def test_elimination_leaves_the_same_answer_as_the_whole_system():
+    shots, _ = line_data(5)
+    c = linearize(line, shots, jnp.array([0.1, 0.2]), jnp.zeros((WINDOWS, 1)), jnp.array([SIGMA]))
+    precision, gradient, _, _ = eliminate(c)
+    whole = np.zeros((2 + WINDOWS, 2 + WINDOWS))
+    whole[:2, :2] = c.hessian
+    for w in range(WINDOWS):
+        whole[2 + w, 2 + w] = c.own[w, 0, 0]
+        whole[2 + w, :2] = whole[:2, 2 + w] = c.cross[w, 0]
+    right = np.concatenate([c.gradient, c.own_gradient[:, 0]])
+    np.testing.assert_allclose(np.linalg.solve(precision, gradient), np.linalg.solve(whole, right)[:2], rtol=1e-8)
+    np.testing.assert_allclose(np.linalg.inv(precision), np.linalg.inv(whole)[:2, :2], rtol=1e-8)
+
+
+def test_the_floor_of_the_noise_is_what_the_sensor_resolves():
+    values = np.round(np.random.default_rng(0).normal(size=(4, ROWS, 1)), 1)
+    shots = Shots(jnp.zeros(4), jnp.asarray(values), jnp.ones(values.shape, bool), jnp.ones(1))
+    assert 1e-4 <= float(noise_floor(shots)[0]) <= 0.1 / np.sqrt(12) + 1e-9

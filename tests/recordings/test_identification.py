@@ -1,0 +1,93 @@
+"""`infer_case` on made-up machines whose parameters are known."""
+
+import jax
+import numpy as np
+import pytest
+
+from bayessim_jax.recordings.identification import infer_case
+from bayessim_jax.recordings.loading import load_case
+from bayessim_jax.recordings.shots import case_model, split_windows
+from benchmarks.worlds import make_case
+
+
+@pytest.fixture(autouse=True)
+def in_double_precision():
+    jax.config.update("jax_enable_x64", True)
+    yield
+    jax.config.update("jax_enable_x64", False)
+
+
+def inferred(folder, seed=0, **options):
+    return infer_case(jax.random.key(seed), case_model(load_case(folder).check(), **options))
+
+
+def test_parameters_noise_and_predictions_of_a_pendulum(tmp_path):
+    truth = make_case(tmp_path / "rig", "pendulum", seed=3)
+    result = inferred(tmp_path / "rig")
+    draws = np.asarray(result.posterior.draws)
+    assert abs(draws.mean() - truth["mass"]) < 5 * draws.std() + 2e-4
+    assert draws.std() < 1e-3
+    noise = dict(zip(result.model.channels, np.asarray(result.posterior.fit.sigma), strict=True))
+    assert noise["joint/hinge/qpos"] == pytest.approx(1e-3, rel=0.15)
+    assert noise["joint/hinge/qvel"] == pytest.approx(1e-2, rel=0.15)
+    assert result.scores["posterior"].nrmse < 1.3 * result.noise_floor
+    assert result.scores["posterior"].nrmse < result.scores["baseline"].nrmse
+    assert set(result.fitted.recording) & set(result.held_out.recording) == set()
+    assert result.identifiability.not_informed == []
+
+
+def test_without_measured_velocities(tmp_path):
+    truth = make_case(tmp_path / "rig", "pendulum", seed=4, velocities=False)
+    result = inferred(tmp_path / "rig")
+    draws = np.asarray(result.posterior.draws)
+    assert result.model.channels == ("joint/hinge/qpos",)
+    assert abs(draws.mean() - truth["mass"]) < 5 * draws.std() + 2e-4
+
+
+def test_one_recording_is_split_by_windows(tmp_path):
+    make_case(tmp_path / "rig", "slide", seed=5, recordings=1, seconds=6.0)
+    fitted, held = split_windows(case_model(load_case(tmp_path / "rig").check()))
+    assert len(held) >= 2
+    assert set(np.round(fitted.start, 6)) & set(np.round(held.start, 6)) == set()
+
+
+def test_a_parameter_that_nothing_depends_on_is_named(tmp_path):
+    folder = tmp_path / "rig"
+    make_case(folder, "slide", seed=6)
+    text = (folder / "case.toml").read_text()
+    text += '\n[[parameters]]\nname = "lift"\ntargets = ["body/carriage/ipos/2"]\n'
+    text += 'prior = { distribution = "uniform", low = -0.1, high = 0.1 }\n'
+    (folder / "case.toml").write_text(text)
+    found = inferred(folder).identifiability
+    assert found.not_informed == ["lift"]
+
+
+def test_two_that_trade_off_are_a_ridge(tmp_path):
+    folder = tmp_path / "rig"
+    make_case(folder, "slide", seed=7)
+    text = (folder / "case.toml").read_text()
+    text += '\n[[parameters]]\nname = "gear"\ntargets = ["actuator/motor/gear"]\n'
+    text += 'prior = { distribution = "uniform", low = 0.5, high = 1.6 }\n'
+    (folder / "case.toml").write_text(text)
+    result = inferred(folder)
+    assert [set(r[:2]) for r in result.identifiability.ridges] == [{"mass", "gear"}]
+
+
+def test_engines_agree_on_the_posterior(tmp_path):
+    make_case(tmp_path / "rig", "pendulum", seed=8, recordings=2, seconds=2.0)
+    tree, c = (np.asarray(inferred(tmp_path / "rig", engine=e).posterior.draws) for e in ("tree", "mujoco"))
+    assert tree.mean() == pytest.approx(c.mean(), abs=0.2 * tree.std())
+    assert tree.std() == pytest.approx(c.std(), rel=0.2)
+
+
+@pytest.mark.slow
+def test_credible_sets_of_many_worlds_hold_the_truth_as_often_as_they_say(tmp_path):
+    levels = []
+    for seed in range(60):
+        folder = tmp_path / f"rig{seed}"
+        truth = make_case(folder, "slide", seed=seed, recordings=2, seconds=2.0)
+        draws = np.asarray(inferred(folder, seed).posterior.draws)[:, 0]
+        levels.append((draws < truth["mass"]).mean())
+    central = np.abs(2 * np.array(levels) - 1)
+    assert 0.35 <= (central < 0.5).mean() <= 0.65
+    assert (central < 0.9).mean() >= 0.8
