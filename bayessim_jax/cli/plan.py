@@ -49,9 +49,8 @@ class Plan:
         """The state of every seed before the first round, with a leading axis over the seeds."""
         one = lambda setup, key: online.init(online.split(key).init, setup)  # noqa: E731
         states = jax.jit(jax.vmap(one, (None, 0)))(self.setup, self.keys)
-        return jax.tree.map(
-            lambda leaf: leaf.astype(leaf.dtype), states
-        )  # no weak types: what is compiled fits a checkpoint
+        # no weak types: what is compiled fits a checkpoint
+        return jax.tree.map(lambda leaf: leaf.astype(leaf.dtype), states)
 
     def compile(self, states: online.State) -> Callable[[online.State], tuple[online.State, online.RoundInfo]]:
         """One round of all seeds as compiled functions of their states, the same round that `online.run` does.
