@@ -22,7 +22,7 @@ __all__ = ["ENCODERS", "Encoder", "Lstm", "lookup_encoder", "transition_features
 class Encoder(Protocol):
     """Maps features of shape (batch, steps, features) and a mask of valid steps to (batch, size)."""
 
-    def init(self, key: PRNGKeyArray, steps: int, features: int) -> Any:
+    def init(self, key: PRNGKeyArray, features: int) -> Any:
         """Random weights."""
         ...
 
@@ -82,7 +82,7 @@ class Lstm:
     frame: int = struct.field(pytree_node=False, default=1)
     """Successive steps whose readings are averaged."""
 
-    def init(self, key: PRNGKeyArray, steps: int, features: int) -> dict[str, Any]:
+    def init(self, key: PRNGKeyArray, features: int) -> dict[str, Any]:
         """Glorot weights, and a forget gate that starts open."""
         w_key, u_key, *keys = jax.random.split(key, 2 + len(self.widths))
         inputs = (features, *self.widths)
