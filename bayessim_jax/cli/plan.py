@@ -15,12 +15,13 @@ from jaxtyping import Float
 from bayessim_jax import learning, online, systems
 from bayessim_jax.cli.citations import used_sources
 from bayessim_jax.cli.options import Settings
-from bayessim_jax.cli.parsing import UsageError, near_miss
+from bayessim_jax.cli.parsing import UsageError
 from bayessim_jax.contracts import Box
 from bayessim_jax.engines.gymnasium import gymnasium_target
 from bayessim_jax.engines.simulated import SimulatedTarget
 from bayessim_jax.inference.estimators import fourier_mixture, recurrent_mixture, summary_mixture
 from bayessim_jax.inference.fit import Schedule
+from bayessim_jax.spelling import near_miss
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping

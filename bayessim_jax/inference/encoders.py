@@ -6,7 +6,6 @@ observations, their finite differences, the action, and whether the step happene
 
 from __future__ import annotations
 
-import difflib
 from typing import Any, Protocol
 
 import jax
@@ -15,6 +14,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from bayessim_jax.contracts import Recording
+from bayessim_jax.spelling import find_named
 
 __all__ = ["ENCODERS", "Encoder", "Lstm", "lookup_encoder", "transition_features"]
 
@@ -172,8 +172,4 @@ ENCODERS: dict[str, Encoder] = {"pooled_lstm": Lstm(size=32, widths=(32, 32), fr
 
 def lookup_encoder(name: str) -> Encoder:
     """Find an encoder by name, or raise `ValueError` with the near miss."""
-    if name in ENCODERS:
-        return ENCODERS[name]
-    near = difflib.get_close_matches(name, ENCODERS, n=1, cutoff=0.4)
-    hint = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(ENCODERS)}."
-    raise ValueError(f"unknown encoder {name!r}: {hint}")
+    return find_named(name, ENCODERS, "unknown encoder")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from typing import TYPE_CHECKING, Any
 
 from bayessim_jax.learning.fixed import Fixed as Fixed
@@ -10,6 +9,7 @@ from bayessim_jax.learning.fixed import RandomPolicy as RandomPolicy
 from bayessim_jax.learning.policies import NetworkPolicy as NetworkPolicy
 from bayessim_jax.learning.ppo import Ppo as Ppo
 from bayessim_jax.learning.sac import Sac as Sac
+from bayessim_jax.spelling import find_named
 
 if TYPE_CHECKING:
     from bayessim_jax.contracts import System, Task
@@ -41,9 +41,5 @@ acrobot never reaches its line.
 
 def default_learner(system_name: str, system: System[Any], task: Task[Any]) -> Ppo | Sac:
     """The learner of a registered system, or `ValueError` with the near miss."""
-    if system_name not in DEFAULTS:
-        near = difflib.get_close_matches(system_name, DEFAULTS, n=1, cutoff=0.4)
-        hint = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(DEFAULTS)}."
-        raise ValueError(f"no learner is registered for the system {system_name!r}: {hint}")
-    learner, settings = DEFAULTS[system_name]
+    learner, settings = find_named(system_name, DEFAULTS, "no learner is registered for the system")
     return LEARNERS[learner].create(system, task, **settings)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from bayessim_jax.spelling import find_named
 from bayessim_jax.systems.acrobot import Acrobot as Acrobot
 from bayessim_jax.systems.acrobot import Raise as Raise
 from bayessim_jax.systems.cartpole import Balance as Balance
@@ -40,9 +40,5 @@ SYSTEMS: dict[str, Entry] = {
 
 
 def lookup(name: str) -> Entry:
-    """Find a registered system, or raise `ValueError` with the near misses."""
-    if name in SYSTEMS:
-        return SYSTEMS[name]
-    near = difflib.get_close_matches(name, SYSTEMS, n=1, cutoff=0.4)
-    hint = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(SYSTEMS)}."
-    raise ValueError(f"unknown system {name!r}: {hint}")
+    """Find a registered system, or raise `ValueError` with the near miss."""
+    return find_named(name, SYSTEMS, "unknown system")
