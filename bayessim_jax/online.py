@@ -47,7 +47,7 @@ __all__ = [
 
 
 COMPILER_OPTIONS = {"xla_backend_optimization_level": 1}
-"""For `jax.jit(run, …, compiler_options=…)`: a whole run compiles a fifth faster and takes as long."""
+"""For `jax.jit(run, …, compiler_options=…)`: a whole run compiles faster and takes as long."""
 
 
 @struct.dataclass
