@@ -17,7 +17,7 @@ from bayessim_jax.cli.citations import used_sources
 from bayessim_jax.cli.options import Settings
 from bayessim_jax.cli.parsing import UsageError
 from bayessim_jax.contracts import Box
-from bayessim_jax.engines.gymnasium import gymnasium_target
+from bayessim_jax.engines.gymnasium import GYMNASIUM, gymnasium_target
 from bayessim_jax.engines.simulated import SimulatedTarget
 from bayessim_jax.inference.estimators import fourier_mixture, recurrent_mixture, summary_mixture
 from bayessim_jax.inference.fit import Schedule
@@ -104,6 +104,8 @@ def make_plan(settings: Settings) -> Plan:
 
 def _make_plan(settings: Settings) -> Plan:
     entry = systems.lookup(settings.system)
+    if settings.target == "gymnasium" and settings.system not in GYMNASIUM:
+        raise ValueError(f"Gymnasium has no environment for {settings.system}; add --target simulated.")
     names = entry.system().parameters.names
     _check_names(settings.prior, names, "prior")
     system = entry.system(**settings.prior, noise=settings.noise)
