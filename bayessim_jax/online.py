@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bayessim_jax.beliefs import Truncated
 from bayessim_jax.contracts import Estimator, Learner, Policy, Recording, Scalar, System, Target, Task
@@ -47,7 +47,7 @@ __all__ = [
 
 
 COMPILER_OPTIONS = {"xla_backend_optimization_level": 1}
-"""For `jax.jit(run, …, compiler_options=…)`: a whole run compiles a fifth faster and takes as long."""
+"""For `jax.jit(run, …, compiler_options=…)`: a whole run compiles faster and takes as long."""
 
 
 @struct.dataclass
@@ -139,7 +139,7 @@ class RoundInfo:
     fit: Any
     """The estimator's Info of the fit: `log_q_train`, `log_q_validation`, `best_epoch`, `overfit`, `nonfinite`."""
     calibration: Any
-    """The estimator's Info of the calibration: `coverage50`, `coverage90`, `widen`, `overconfident`, ...."""
+    """The estimator's Info of the calibration: `coverage50`, `coverage90`, `widen`, `overconfident`, …."""
     learning: Any
     """The learner's Info: at least `return_mean` and `nonfinite`."""
     return_target: Scalar
@@ -148,9 +148,9 @@ class RoundInfo:
     """Simulations of this round that were masked because a number was not finite."""
     pool_size: Scalar
     """Effective number of simulations that the fit stood on, (Σ w)² / Σ w²."""
-    uninformed: Any
+    uninformed: Bool[Array, ""]
     """The posterior of this round was wider than the belief and agreed with it, so the belief stayed."""
-    collapsed: Any
+    collapsed: Bool[Array, ""]
     """The belief fell to less than a thousandth of its volume in one round while the estimator was over-confident."""
 
 
@@ -199,21 +199,17 @@ def init(key: PRNGKeyArray, setup: Setup) -> State:
     )
 
 
-def simulate(key: PRNGKeyArray, setup: Setup, policy: Policy, thetas: Float[Array, "n d"]) -> Recording:
-    """One recording for every θ under one policy; leading axis n."""
+def simulate(
+    key: PRNGKeyArray, setup: Setup, policy: Any, thetas: Float[Array, "n d"], slots: Int[Array, " n"] | None = None
+) -> Recording:
+    """One recording for every θ under one policy; with `slots`, under that slot of stacked ones; leading axis n."""
     keys = jax.random.split(key, thetas.shape[0])
-    return jax.vmap(lambda k, theta: rollout(k, setup.system, theta, policy, setup.steps, setup.task))(keys, thetas)
-
-
-def simulate_mixed(key: PRNGKeyArray, setup: Setup, policies: Any, slots: Array, thetas: Array) -> Recording:
-    """One recording for every θ, each under the policy of its slot; leading axis n."""
-    keys = jax.random.split(key, thetas.shape[0])
-    chosen = jax.tree.map(lambda leaf: leaf[slots], policies)
+    policies = policy if slots is None else jax.tree.map(lambda leaf: leaf[slots], policy)
 
     def one(key: PRNGKeyArray, policy: Policy, theta: Float[Array, " d"]) -> Recording:
         return rollout(key, setup.system, theta, policy, setup.steps, setup.task)
 
-    return jax.vmap(one)(keys, chosen, thetas)
+    return jax.vmap(one, in_axes=(0, None if slots is None else 0, 0))(keys, policies, thetas)
 
 
 def record(key: PRNGKeyArray, setup: Setup, target: Target, state: State) -> Recording:
@@ -255,7 +251,7 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
     slot_key, simulate_key = jax.random.split(simulate_key)
     earlier = jax.random.categorical(slot_key, jnp.where(use, 0.0, -jnp.inf), shape=(fresh,))
     slots = jnp.where(jnp.arange(fresh) % 2 == 0, newest, jnp.where(use.any(), earlier, newest))
-    simulated = simulate_mixed(simulate_key, setup, policies, slots, thetas[:fresh])
+    simulated = simulate(simulate_key, setup, policies, thetas[:fresh], slots)
     pool = _insert(state.pool, state.round, thetas[:fresh], jax.tree.map(lambda x: x[:, None], simulated), proposal)
     weights = pool_weights(pool.thetas, pool.proposals, pool.filled, proposal).ravel()
     points, singles = jax.tree.map(_rows, (pool.thetas, pool.recordings))

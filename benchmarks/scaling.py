@@ -79,7 +79,9 @@ def draw_figure(points: list[Point], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
-    colors = dict(zip(dict.fromkeys(p.system for p in points), ("#0072B2", "#D55E00", "#009E73"), strict=False))
+    colors = dict(
+        zip(dict.fromkeys(p.system for p in points), ("#0072B2", "#D55E00", "#009E73", "#CC79A7"), strict=False)
+    )
     dashes = {"network": "-", "random": "--"}
     for system, color in colors.items():
         for policy, dash in dashes.items():

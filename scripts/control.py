@@ -11,40 +11,42 @@ to the time limit.
 from __future__ import annotations
 
 import argparse
-import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from trials import save
+from trials import resume
 
 from bayessim_jax import online
 from bayessim_jax.beliefs import Uniform
 from bayessim_jax.contracts import Belief, Box
-from bayessim_jax.engines import gymnasium_target
+from bayessim_jax.engines.gymnasium import GYMNASIUM, gymnasium_target
 from bayessim_jax.learning import default_learner
-from bayessim_jax.systems import SYSTEMS, lookup
+from bayessim_jax.systems import lookup
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 
 def main() -> None:
     """Run the systems asked for and print a table for each."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--systems", nargs="+", choices=SYSTEMS, default=list(SYSTEMS))
+    parser.add_argument("--systems", nargs="+", choices=GYMNASIUM, default=list(GYMNASIUM))
     parser.add_argument("--runs", type=int, default=6)
     parser.add_argument("--rounds", type=int, default=30)
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, help="append every run to this file of JSON lines")
+    parser.add_argument("--out", type=Path, help="file of JSON lines to append runs to, and to resume from")
     args = parser.parse_args()
     for name in args.systems:
         rows: list[dict[str, Any]] = []
-        for result in _runs(name, args.runs, args.rounds, args.episodes, args.seed):
+        labels = {"system": name, "seed": args.seed, "rounds": args.rounds, "episodes": args.episodes}
+        make = _trial(name, args.rounds, args.episodes, args.seed)
+        for result in resume(make, args.runs, args.out, labels):
             rows.append(result)
             print(f"{name} {len(rows)}/{args.runs}: {result['seconds']:.0f} s", end="\r", flush=True)
-            if args.out:
-                save(args.out, result | {"system": name})
         print(f"{name}: {args.runs} runs of {args.rounds} rounds, {args.episodes} episodes each" + 20 * " ")
         for way in ("online", "uniform", "truth"):
             means = np.array([r[way]["return"] for r in rows])
@@ -57,7 +59,8 @@ def main() -> None:
             )
 
 
-def _runs(name: str, runs: int, rounds: int, episodes: int, seed: int) -> Any:
+def _trial(name: str, rounds: int, episodes: int, seed: int) -> Callable[[int], dict[str, Any]]:
+    """What one run gives, as a function of its number."""
     entry = lookup(name)
     system, task = entry.system(), entry.task()
     learner, box = default_learner(name, system, task), system.parameters
@@ -77,8 +80,7 @@ def _runs(name: str, runs: int, rounds: int, episodes: int, seed: int) -> Any:
         seen = jax.vmap(lambda k: target.record(k, policy, task.steps))(jax.random.split(key, episodes))
         return {"return": seen.rewards.sum(-1).mean(), "whole": seen.valid.all(-1).mean()}
 
-    for index in range(runs):
-        start = time.monotonic()
+    def make(index: int) -> dict[str, Any]:
         truth_key, run_key, judge_key = jax.random.split(jax.random.fold_in(jax.random.key(seed), index), 3)
         truth = jax.random.uniform(truth_key, box.low.shape, minval=box.low, maxval=box.high)
         target = gymnasium_target(name, truth, system.noise)
@@ -89,7 +91,9 @@ def _runs(name: str, runs: int, rounds: int, episodes: int, seed: int) -> Any:
             "truth": train(run_key, known),
         }
         judged = {way: jax.tree.map(float, judge(judge_key, target, state)) for way, state in states.items()}
-        yield judged | {"run": index, "truth_values": np.asarray(truth), "seconds": time.monotonic() - start}
+        return judged | {"truth_values": np.asarray(truth)}
+
+    return make
 
 
 if __name__ == "__main__":

@@ -12,9 +12,10 @@ import numpy as np
 
 from bayessim_jax import online
 from bayessim_jax.engines.simulated import SimulatedTarget
+from bayessim_jax.recordings.summaries import summarize
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
 
@@ -46,12 +47,11 @@ def trials(
         _, infos = online.run(run_key, setup, target, rounds=rounds)
 
         def judge(key: Any, belief: Any) -> dict[str, Any]:
-            samples = jax.vmap(belief.sample)(jax.random.split(key, draws))
-            log_truth = belief.log_prob(truth)
+            summary = summarize(key, belief, truth, draws)
             return {
-                "log_q": log_truth,
-                "level": (jax.vmap(belief.log_prob)(samples) > log_truth).mean(),
-                "rank": (samples < truth).mean(0),
+                "log_q": summary.log_prob_true,
+                "level": summary.level_true,
+                "rank": summary.rank_true,
                 "log_marginals": jnp.stack(
                     [belief.mixture.marginal(pair).log_prob(truth[jnp.array(pair)]) for pair in pairs]
                 ),
@@ -68,14 +68,25 @@ def trials(
         }
 
     compiled = jax.jit(one)
-    labels = (labels or {}) | {"seed": seed, "rounds": rounds}
+
+    def make(index: int) -> dict[str, Any]:
+        return jax.tree.map(np.asarray, compiled(jax.random.fold_in(jax.random.key(seed), index)))
+
+    yield from resume(make, runs, out, (labels or {}) | {"seed": seed, "rounds": rounds})
+
+
+def resume(
+    make: Callable[[int], dict[str, Any]], runs: int, out: Path | None, labels: dict[str, Any]
+) -> Iterator[dict[str, Any]]:
+    """Yield `make(index)` of each run with its `run` and `seconds`; what the file `out` holds of them is not made.
+
+    Runs that are made are appended to it, under their `labels`.
+    """
     known = {result["run"]: result for result in load(out, labels)} if out else {}
     for index in range(runs):
         if index not in known:
             start = time.monotonic()
-            result = jax.block_until_ready(compiled(jax.random.fold_in(jax.random.key(seed), index)))
-            seconds = time.monotonic() - start
-            known[index] = jax.tree.map(np.asarray, result) | {"run": index, "seconds": seconds}
+            known[index] = make(index) | {"run": index, "seconds": time.monotonic() - start}
             if out:
                 save(out, labels | known[index])
         yield known[index]

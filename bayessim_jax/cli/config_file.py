@@ -7,7 +7,8 @@ import tomllib
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_hints
 
 from bayessim_jax.cli.options import Settings
-from bayessim_jax.cli.parsing import UsageError, near_miss
+from bayessim_jax.cli.parsing import UsageError
+from bayessim_jax.spelling import near_miss
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

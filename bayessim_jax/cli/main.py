@@ -6,7 +6,8 @@ import sys
 from typing import TYPE_CHECKING
 
 from bayessim_jax import __version__
-from bayessim_jax.cli.parsing import UsageError, near_miss
+from bayessim_jax.cli.parsing import UsageError
+from bayessim_jax.spelling import near_miss
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import difflib
 import io
 import re
 from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 
 import tyro
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+from bayessim_jax.spelling import near_miss
 
-__all__ = ["UsageError", "near_miss", "parse"]
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+__all__ = ["UsageError", "parse"]
 
 C = TypeVar("C")
 BOX = str.maketrans("│╭╮╰╯─", "      ")
@@ -22,13 +23,6 @@ BOX = str.maketrans("│╭╮╰╯─", "      ")
 
 class UsageError(Exception):
     """The user has to change the command or a file; ends the program with one line and exit code 2."""
-
-
-def near_miss(word: str, known: Iterable[str]) -> str:
-    """`did you mean 'x'?`, or the choices where nothing is near."""
-    known = list(known)
-    near = difflib.get_close_matches(word, known, n=1, cutoff=0.4)
-    return f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(known)}."
 
 
 def parse(schema: type[C], words: Sequence[str], prog: str, default: C | None = None) -> C:

@@ -15,12 +15,13 @@ from jaxtyping import Float
 from bayessim_jax import learning, online, systems
 from bayessim_jax.cli.citations import used_sources
 from bayessim_jax.cli.options import Settings
-from bayessim_jax.cli.parsing import UsageError, near_miss
+from bayessim_jax.cli.parsing import UsageError
 from bayessim_jax.contracts import Box
-from bayessim_jax.engines.gymnasium import gymnasium_target
+from bayessim_jax.engines.gymnasium import GYMNASIUM, gymnasium_target
 from bayessim_jax.engines.simulated import SimulatedTarget
 from bayessim_jax.inference.estimators import fourier_mixture, recurrent_mixture, summary_mixture
 from bayessim_jax.inference.fit import Schedule
+from bayessim_jax.spelling import near_miss
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -49,9 +50,8 @@ class Plan:
         """The state of every seed before the first round, with a leading axis over the seeds."""
         one = lambda setup, key: online.init(online.split(key).init, setup)  # noqa: E731
         states = jax.jit(jax.vmap(one, (None, 0)))(self.setup, self.keys)
-        return jax.tree.map(
-            lambda leaf: leaf.astype(leaf.dtype), states
-        )  # no weak types: what is compiled fits a checkpoint
+        # no weak types: what is compiled fits a checkpoint
+        return jax.tree.map(lambda leaf: leaf.astype(leaf.dtype), states)
 
     def compile(self, states: online.State) -> Callable[[online.State], tuple[online.State, online.RoundInfo]]:
         """One round of all seeds as compiled functions of their states, the same round that `online.run` does.
@@ -104,6 +104,8 @@ def make_plan(settings: Settings) -> Plan:
 
 def _make_plan(settings: Settings) -> Plan:
     entry = systems.lookup(settings.system)
+    if settings.target == "gymnasium" and settings.system not in GYMNASIUM:
+        raise ValueError(f"Gymnasium has no environment for {settings.system}; add --target simulated.")
     names = entry.system().parameters.names
     _check_names(settings.prior, names, "prior")
     system = entry.system(**settings.prior, noise=settings.noise)

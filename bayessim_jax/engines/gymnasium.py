@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import threading
 from functools import cache, partial
@@ -19,6 +18,7 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from bayessim_jax.contracts import Policy, Recording
 from bayessim_jax.rollout import assemble
+from bayessim_jax.spelling import find_named
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -200,9 +200,5 @@ def gymnasium_target(
     name: str, theta: Float[ArrayLike, " d"], noise: float | Float[ArrayLike, " obs"] = 0.01
 ) -> GymnasiumTarget:
     """The Gymnasium environment behind a system of this package, or `ValueError` with the near miss."""
-    if name not in GYMNASIUM:
-        near = difflib.get_close_matches(name, GYMNASIUM, n=1, cutoff=0.4)
-        hint = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(GYMNASIUM)}."
-        raise ValueError(f"no Gymnasium environment for the system {name!r}: {hint}")
-    env_id, configure, dt = GYMNASIUM[name]
+    env_id, configure, dt = find_named(name, GYMNASIUM, "no Gymnasium environment for the system")
     return GymnasiumTarget.create(env_id, configure, theta, noise, dt)

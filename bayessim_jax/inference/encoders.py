@@ -6,7 +6,6 @@ observations, their finite differences, the action, and whether the step happene
 
 from __future__ import annotations
 
-import difflib
 from typing import Any, Protocol
 
 import jax
@@ -15,6 +14,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from bayessim_jax.contracts import Recording
+from bayessim_jax.spelling import find_named
 
 __all__ = ["ENCODERS", "Encoder", "Lstm", "lookup_encoder", "transition_features"]
 
@@ -22,7 +22,7 @@ __all__ = ["ENCODERS", "Encoder", "Lstm", "lookup_encoder", "transition_features
 class Encoder(Protocol):
     """Maps features of shape (batch, steps, features) and a mask of valid steps to (batch, size)."""
 
-    def init(self, key: PRNGKeyArray, steps: int, features: int) -> Any:
+    def init(self, key: PRNGKeyArray, features: int) -> Any:
         """Random weights."""
         ...
 
@@ -82,7 +82,7 @@ class Lstm:
     frame: int = struct.field(pytree_node=False, default=1)
     """Successive steps whose readings are averaged."""
 
-    def init(self, key: PRNGKeyArray, steps: int, features: int) -> dict[str, Any]:
+    def init(self, key: PRNGKeyArray, features: int) -> dict[str, Any]:
         """Glorot weights, and a forget gate that starts open."""
         w_key, u_key, *keys = jax.random.split(key, 2 + len(self.widths))
         inputs = (features, *self.widths)
@@ -172,8 +172,4 @@ ENCODERS: dict[str, Encoder] = {"pooled_lstm": Lstm(size=32, widths=(32, 32), fr
 
 def lookup_encoder(name: str) -> Encoder:
     """Find an encoder by name, or raise `ValueError` with the near miss."""
-    if name in ENCODERS:
-        return ENCODERS[name]
-    near = difflib.get_close_matches(name, ENCODERS, n=1, cutoff=0.4)
-    hint = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(ENCODERS)}."
-    raise ValueError(f"unknown encoder {name!r}: {hint}")
+    return find_named(name, ENCODERS, "unknown encoder")

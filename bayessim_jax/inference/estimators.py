@@ -92,7 +92,7 @@ class MixtureDensity:
 
         def member(key: PRNGKeyArray) -> dict[str, Any]:
             encoder_key, head_key = jax.random.split(key)
-            encoder = self.encoder.init(encoder_key, steps, features)
+            encoder = self.encoder.init(encoder_key, features)
             x, valid = jnp.zeros((1, steps, features)), jnp.ones((1, steps), bool)
             width = jax.eval_shape(self.encoder.apply, encoder, x, valid).shape[-1]
             return {"encoder": encoder, "head": self.head.init(head_key, width, d)}

@@ -10,7 +10,6 @@ whether X is every recording so far or this round's alone.
 
 from __future__ import annotations
 
-import difflib
 from typing import Any, Protocol
 
 import jax
@@ -20,6 +19,7 @@ from jaxtyping import Array, Float
 
 from bayessim_jax.beliefs import GaussianMixture, Truncated, Uniform, quotient, reduce
 from bayessim_jax.contracts import Belief, Box
+from bayessim_jax.spelling import find_named
 
 __all__ = ["PROPOSALS", "Corrected", "Paper", "ProposalMode", "TruncatedPrior", "lookup_proposal", "pool_weights"]
 
@@ -156,8 +156,4 @@ PROPOSALS: dict[str, ProposalMode] = {"corrected": Corrected(), "paper": Paper()
 
 def lookup_proposal(name: str) -> ProposalMode:
     """Find a proposal mode by name, or raise `ValueError` with the near miss."""
-    if name in PROPOSALS:
-        return PROPOSALS[name]
-    near = difflib.get_close_matches(name, PROPOSALS, n=1, cutoff=0.4)
-    hint = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(PROPOSALS)}."
-    raise ValueError(f"unknown proposal {name!r}: {hint}")
+    return find_named(name, PROPOSALS, "unknown proposal")

@@ -64,7 +64,7 @@ _predict = jax.jit(_predict_all, static_argnums=0)
 def prediction_errors(predict: Predict, shots: Shots, z: Float[Array, " d"]) -> Errors:
     """Measured minus predicted in every row after a window's first; windows that diverge are left out and counted."""
     predicted, y, measured = predict_windows(predict, shots, z), np.asarray(shots.y), np.asarray(shots.measured)
-    lost = ~np.isfinite(np.where(measured, predicted, 0.0)).all((1, 2))
+    lost = np.asarray(~np.isfinite(np.where(measured, predicted, 0.0)).all((1, 2)))
     measured = measured & ~lost[:, None, None]
     measured[:, 0] = False
     return Errors(np.where(measured, y - np.nan_to_num(predicted), 0.0), measured, int(lost.sum()))

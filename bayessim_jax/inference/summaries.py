@@ -36,7 +36,7 @@ class Summary:
     actions: int = struct.field(pytree_node=False, default=1)
     """Length of the action vector: the last so many features."""
 
-    def init(self, key: PRNGKeyArray, steps: int, features: int) -> dict[str, Array]:
+    def init(self, key: PRNGKeyArray, features: int) -> dict[str, Array]:
         """Nothing to learn."""
         return {}
 
@@ -61,7 +61,7 @@ class FourierSummary:
     features: int = struct.field(pytree_node=False, default=300)
     actions: int = struct.field(pytree_node=False, default=1)
 
-    def init(self, key: PRNGKeyArray, steps: int, features: int) -> dict[str, Array]:
+    def init(self, key: PRNGKeyArray, features: int) -> dict[str, Array]:
         """One length scale."""
         return {"log_scale": jnp.log(jnp.array(3.0))}
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-__all__ = ["ENGINE", "Draws", "read_draws", "read_group", "read_history", "write_posterior"]
+__all__ = ["ENGINE", "Draws", "read_draws", "read_group", "read_history", "variable", "write_posterior"]
 
 ENGINE = "h5netcdf"
 
@@ -36,8 +36,8 @@ def write_posterior(
     """Write the groups `prior`, `posterior` (last round), `posterior_rounds` and `observed_data` in one step.
 
     Draws have the dimensions (chain, draw), as ArviZ wants them, then `seed` where several seeds were run; a variable
-    for each parameter, each sensor channel and each action channel, with its unit as an attribute. A parameter carries
-    its prior's bounds and, where it is known, the truth (one for each seed).
+    for each parameter, each sensor channel and each action channel, with its unit as an attribute; `base.x` holds the
+    channel `base/x`. A parameter carries its prior's bounds and, where it is known, the truth (one for each seed).
     """
     several = len(seeds) > 1
     seed_dim = ("seed",) if several else ()
@@ -47,7 +47,7 @@ def write_posterior(
 
     def named(x: np.ndarray, dims: tuple[str, ...], box: Box | Discrete, prefix: str = "") -> dict[str, Any]:
         units = zip(box.names, box.units, strict=True)
-        return {prefix + name: (dims, x[..., i], {"units": unit}) for i, (name, unit) in enumerate(units)}
+        return {variable(prefix + name): (dims, x[..., i], {"units": unit}) for i, (name, unit) in enumerate(units)}
 
     def marked(variables: dict[str, Any]) -> dict[str, Any]:
         low, high = np.asarray(parameters.low, float), np.asarray(parameters.high, float)
@@ -110,7 +110,7 @@ def read_history(path: Path, observations: Box, actions: Box | Discrete) -> Hist
     widen = lambda x: x if "seed" in seen.dims else x[:, None]  # noqa: E731
 
     def stacked(names: Sequence[str], prefix: str = "") -> np.ndarray:
-        return widen(np.stack([seen[prefix + name].values for name in names], axis=-1))
+        return widen(np.stack([seen[variable(prefix + name)].values for name in names], axis=-1))
 
     return History(
         draws=read_draws(path).draws,
@@ -120,6 +120,11 @@ def read_history(path: Path, observations: Box, actions: Box | Discrete) -> Hist
         rewards=widen(seen["reward"].values),
         valid=widen(seen["valid"].values.astype(bool)),
     )
+
+
+def variable(name: str) -> str:
+    """The name of a channel's variable, in which xarray allows no slash."""
+    return name.replace("/", ".")
 
 
 def read_group(path: Path, group: str) -> xr.Dataset:

@@ -14,7 +14,7 @@ from bayessim_jax import __version__
 from bayessim_jax.recordings.files import replace_file, to_json, write_text
 from bayessim_jax.recordings.loading import LoadedCase, load_case
 from bayessim_jax.recordings.mjcf import referenced_files
-from bayessim_jax.recordings.posterior import ENGINE, read_group
+from bayessim_jax.recordings.posterior import ENGINE, read_group, variable
 from bayessim_jax.recordings.run_folder import RunFolder
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def _write_posterior(path: Path, result: CaseInference, seed: int) -> None:
     measured = np.asarray(model.shots(windows).measured)
     seen = np.where(measured, y, np.nan)
     rows = ("window", "row")
-    dotted = [c.replace("/", ".") for c in channels]  # netCDF keeps the slash for groups
+    dotted = [variable(c) for c in channels]
     observed: dict[str, Any] = {dotted[k]: (rows, seen[..., k], {"units": units[c]}) for k, c in enumerate(channels)}
     observed["time"] = (rows, windows.start[:, None] + windows.time, {"units": "s"})
     observed["recording"] = (("window",), [model.recordings[i].name for i in windows.recording])

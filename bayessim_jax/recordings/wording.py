@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
+
+from bayessim_jax.spelling import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -64,9 +65,8 @@ def quote(text: object) -> str:
 def hint(word: str, known: Iterable[str], count: int = 3) -> str:
     """`did you mean 'x' or 'y'?` with the near misses, or the choices where nothing is near."""
     known = list(known)
-    near = difflib.get_close_matches(word, known, n=count, cutoff=0.5)
-    if near:
-        return f"did you mean {' or '.join(quote(name) for name in near)}?"
+    if near := did_you_mean(word, known, count, cutoff=0.5, show=quote):
+        return near
     if not known:
         return "there is none to choose from"
     more = f", … ({len(known)} in all)" if len(known) > 8 else ""

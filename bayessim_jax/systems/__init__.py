@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from bayessim_jax.spelling import find_named
 from bayessim_jax.systems.acrobot import Acrobot as Acrobot
 from bayessim_jax.systems.acrobot import Raise as Raise
 from bayessim_jax.systems.cartpole import Balance as Balance
@@ -13,6 +13,8 @@ from bayessim_jax.systems.cartpole import CartPole as CartPole
 from bayessim_jax.systems.functional import from_functions as from_functions
 from bayessim_jax.systems.pendulum import Pendulum as Pendulum
 from bayessim_jax.systems.pendulum import SwingUp as SwingUp
+from bayessim_jax.systems.skid_steer import FollowCircle as FollowCircle
+from bayessim_jax.systems.skid_steer import SkidSteer as SkidSteer
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,7 +26,7 @@ __all__ = ["SYSTEMS", "Entry", "lookup"]
 
 @dataclass(frozen=True)
 class Entry:
-    """A registered system: how to make it, its task, and the learner the paper trains on it."""
+    """A registered system: how to make it, its task, and the learner that is trained on it."""
 
     system: Callable[..., System[Any]]
     task: Callable[..., Task[Any]]
@@ -36,13 +38,10 @@ SYSTEMS: dict[str, Entry] = {
     "cartpole": Entry(CartPole.create, Balance, "ppo", "keep a pole upright on a cart that is pushed left or right"),
     "pendulum": Entry(Pendulum.create, SwingUp, "sac", "swing a rod up with a motor too weak to lift it at once"),
     "acrobot": Entry(Acrobot.create, Raise, "ppo", "swing two links up with a motor at the elbow only"),
+    "skid_steer": Entry(SkidSteer.create, FollowCircle, "sac", "drive around a circle on wheels that slide sideways"),
 }
 
 
 def lookup(name: str) -> Entry:
-    """Find a registered system, or raise `ValueError` with the near misses."""
-    if name in SYSTEMS:
-        return SYSTEMS[name]
-    near = difflib.get_close_matches(name, SYSTEMS, n=1, cutoff=0.4)
-    hint = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(SYSTEMS)}."
-    raise ValueError(f"unknown system {name!r}: {hint}")
+    """Find a registered system, or raise `ValueError` with the near miss."""
+    return find_named(name, SYSTEMS, "unknown system")

@@ -101,6 +101,12 @@ def test_bad_config(capsys, tmp_path, text, message):
     assert not (tmp_path / "run").exists()
 
 
+def test_a_system_that_gymnasium_does_not_have(capsys, tmp_path):
+    told = refused(capsys, "skid_steer", "--out", tmp_path / "run")
+    assert told == "bayessim: Gymnasium has no environment for skid_steer; add --target simulated.\n"
+    assert not (tmp_path / "run").exists()
+
+
 def test_bad_folders(capsys, tmp_path):
     (tmp_path / "note.txt").write_text("mine")
     assert "already used; continue with --resume" in refused(capsys, "cartpole", "--out", tmp_path)

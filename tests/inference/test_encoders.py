@@ -31,7 +31,7 @@ def _naive_lstm(params, x, valid):
 def test_lstm_and_its_gradient_equal_the_textbook_recurrence():
     x, valid = _data()
     encoder = Lstm(size=7)
-    params = encoder.init(jax.random.key(1), STEPS, FEATURES)
+    params = encoder.init(jax.random.key(1), FEATURES)
     target = jax.random.normal(jax.random.key(2), (BATCH, 7))
     ours = jax.value_and_grad(lambda p, x: (encoder.apply(p, x, valid) * target).sum(), (0, 1))(params, x)
     naive = jax.value_and_grad(lambda p, x: (_naive_lstm(p, x, valid) * target).sum(), (0, 1))(params, x)
@@ -43,7 +43,7 @@ def test_lstm_and_its_gradient_equal_the_textbook_recurrence():
 def test_what_comes_after_the_end_does_not_change_the_embedding(name):
     x, valid = _data()
     encoder = lookup_encoder(name)
-    params = encoder.init(jax.random.key(1), STEPS, FEATURES)
+    params = encoder.init(jax.random.key(1), FEATURES)
     clean = jnp.where(valid[..., None], x, 0.0)
     longer = jnp.pad(clean, ((0, 0), (0, 6), (0, 0)))
     longer_valid = jnp.pad(valid, ((0, 0), (0, 6)))
@@ -66,7 +66,7 @@ def test_frames_are_means_over_their_valid_steps():
 def test_layers_that_read_each_step_come_before_the_recurrence():
     x, valid = _data()
     deep, plain = Lstm(size=7, widths=(6,)), Lstm(size=7)
-    params = deep.init(jax.random.key(3), STEPS, FEATURES)
+    params = deep.init(jax.random.key(3), FEATURES)
     (layer,) = params["read"]
     read = jax.nn.gelu(x @ layer["w"] + layer["b"])
     assert jnp.allclose(deep.apply(params, x, valid), plain.apply(params | {"read": []}, read, valid), atol=1e-6)

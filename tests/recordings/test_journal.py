@@ -12,7 +12,7 @@ from bayessim_jax.recordings.checkpoints import Checkpoints
 from bayessim_jax.recordings.journal import Journal
 from bayessim_jax.recordings.posterior import read_history
 from bayessim_jax.recordings.run_folder import RunFolder
-from bayessim_jax.systems import CartPole
+from bayessim_jax.systems import CartPole, SkidSteer
 from tests.recordings.synthetic import SETTINGS, STATE, stacked, state_after
 
 SYSTEM = CartPole.create()
@@ -23,9 +23,9 @@ def journal(folder, seeds=(3, 4), truths=TRUTHS):
     return Journal(folder, SYSTEM, seeds, truths, SETTINGS, {"title": "test"}, simulations=10)
 
 
-def write(book, rounds, truths=TRUTHS):
+def write(book, rounds, truths=TRUTHS, system=SYSTEM):
     for index in rounds:
-        book.write(index, stacked(SYSTEM, index, truths), state_after(index), seconds=2.0)
+        book.write(index, stacked(system, index, truths), state_after(index), seconds=2.0)
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +89,18 @@ def test_one_seed_has_no_seed_dimension_and_no_truth_where_it_is_unknown(tmp_pat
     assert folder.read_metrics()[0]["log_prob_true"] is None
     history = read_history(folder.path / "posterior.nc", SYSTEM.observations, SYSTEM.actions)
     assert history.observations.shape == (1, 1, 2, 6, 4)
+
+
+def test_channels_with_a_slash_are_variables_with_a_dot(tmp_path):
+    system, truths = SkidSteer.create(), np.array([[0.06, 0.5, 0.1]], np.float32)
+    folder = RunFolder(tmp_path / "robot").create()
+    with Journal(folder, system, [3], truths, SETTINGS, {"title": "test"}, simulations=10) as book:
+        write(book, [1, 2], truths, system)
+    seen = groups(folder)["observed_data"]
+    assert seen["base.yaw"].attrs["units"] == "rad"
+    assert seen["action_input.left"].dims == ("round", "recording", "step")
+    history = read_history(folder.path / "posterior.nc", system.observations, system.actions)
+    assert (history.observations.shape, history.actions.shape) == ((2, 1, 2, 6, 3), (2, 1, 2, 5, 2))
 
 
 def test_resumed_equals_whole(whole, tmp_path):

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bayessim_jax import systems
 from bayessim_jax.recordings.loading import load_case
 
 ROOT = Path(__file__).parents[2]
@@ -55,16 +54,7 @@ def test_estimated_velocities_agree_with_those_of_the_authors(name):
 
 
 @pytest.mark.parametrize("name", ["warthog_asphalt", "warthog_ice"])
-def test_a_case_of_a_registered_system(name, monkeypatch):
-    from bayessim_jax.contracts import Box
-
-    class Drive:
-        parameters = Box.create(wheel_radius=(0.2, 0.4, "m"), axial_distance=(0.8, 1.6, "m"), icr_offset=(-1, 1, "m"))
-        observations = Box.create(**{"base/x": (-9, 9, "m"), "base/y": (-9, 9, "m"), "base/yaw": (-9, 9, "rad")})
-        actions = Box.create(**{"input/left": (-9, 9, "rad/s"), "input/right": (-9, 9, "rad/s")})
-
-    entry = systems.Entry(Drive, Drive, "ppo", "a vehicle")
-    monkeypatch.setitem(systems.SYSTEMS, "skid_steer", entry)
+def test_a_case_of_a_registered_system(name):
     loaded = load_case(CASES / name).check()
     assert len(loaded.recordings) == 60
     assert [p.targets for p in loaded.parameters] == [("wheel_radius",), ("axial_distance",), ("icr_offset",)]
