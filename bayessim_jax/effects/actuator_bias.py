@@ -1,0 +1,30 @@
+"""A command that is always off by the same."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+
+from bayessim_jax.effects.contract import ActEffect, EffectParameter, Memory, Moment, Scales, Values
+from bayessim_jax.effects.places import actuators
+
+__all__ = ["ActuatorBias"]
+
+
+class ActuatorBias(ActEffect):
+    """u ↦ u + τ₀, in the unit of the command."""
+
+    name = "actuator_bias"
+
+    def places(self, model: mujoco.MjModel) -> list[str]:
+        """Every actuator."""
+        return actuators(model)
+
+    def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
+        """The bias τ₀."""
+        return (EffectParameter("torque", "", -scales.command, scales.command, 0.0, 0.05 * scales.command),)
+
+    def command(self, values: Values, memory: Memory, command: Any, moment: Moment) -> tuple[Any, Memory]:
+        """The sum u + τ₀."""
+        return command + values["torque"], memory
