@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import mujoco
-
 from bayessim_jax.effects.contract import ActEffect, EffectParameter, Memory, Moment, Scales, Values
-from bayessim_jax.effects.places import actuators
 
 __all__ = ["ActuatorBias"]
 
@@ -16,10 +13,6 @@ class ActuatorBias(ActEffect):
     """u ↦ u + τ₀, in the unit of the command."""
 
     name = "actuator_bias"
-
-    def places(self, model: mujoco.MjModel) -> list[str]:
-        """Every actuator."""
-        return actuators(model)
 
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The bias τ₀."""

@@ -5,10 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
-import mujoco
 
 from bayessim_jax.effects.contract import ActEffect, EffectParameter, Memory, Moment, Scales, Values
-from bayessim_jax.effects.places import actuators
 
 __all__ = ["ActuatorDeadband"]
 
@@ -17,10 +15,6 @@ class ActuatorDeadband(ActEffect):
     """u ↦ sign(u) max(|u| − w, 0) = u − clip(u, ±w), in the unit of the command."""
 
     name = "actuator_deadband"
-
-    def places(self, model: mujoco.MjModel) -> list[str]:
-        """Every actuator."""
-        return actuators(model)
 
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The width w."""

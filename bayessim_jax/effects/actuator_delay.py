@@ -6,35 +6,16 @@ import math
 from typing import Any
 
 import jax.numpy as jnp
-import mujoco
 
 from bayessim_jax.contracts import Scalar
-from bayessim_jax.effects.contract import ActEffect, EffectParameter, Memory, Moment, Number, Scales, Values
-from bayessim_jax.effects.places import actuators
+from bayessim_jax.effects.contract import ActEffect, EffectParameter, Memory, Moment, Scales, Values
 
-__all__ = ["LONGEST", "ActuatorDelay", "look_back", "samples_back"]
+__all__ = ["ActuatorDelay"]
 
 LONGEST = 0.1
 """The longest delay, s; what is remembered is as long."""
 MOST = 100
 """The most time steps that are remembered, which makes the longest delay shorter where time steps are short."""
-
-
-def samples_back(h: float) -> int:
-    """How many earlier time steps are remembered."""
-    return min(math.ceil(LONGEST / h - 1e-9), MOST)
-
-
-def look_back(samples: Any, delay: Scalar, h: float) -> Number:
-    """The number a delay ago of samples h apart, the latest first, on the line between the two nearest."""
-    steps = jnp.clip(delay / h, 0.0, len(samples) - 1.0)
-    whole = jnp.minimum(jnp.floor(steps), len(samples) - 2.0)
-    rest = steps - whole
-    total = 0.0
-    for k, sample in enumerate(samples):
-        weight = jnp.where(whole == k, 1.0 - rest, jnp.where(whole == k - 1, rest, 0.0))
-        total = total + weight * sample
-    return total
 
 
 class ActuatorDelay(ActEffect):
@@ -45,10 +26,7 @@ class ActuatorDelay(ActEffect):
     """
 
     name = "actuator_delay"
-
-    def places(self, model: mujoco.MjModel) -> list[str]:
-        """Every actuator."""
-        return actuators(model)
+    hurries = True
 
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The delay T."""
@@ -62,4 +40,34 @@ class ActuatorDelay(ActEffect):
     def command(self, values: Values, memory: Memory, command: Any, moment: Moment) -> tuple[Any, Memory]:
         """The command T ago."""
         samples = (command, *memory)
-        return look_back(samples, values["seconds"], moment.h), samples[:-1]
+        whole, rest = _split(values["seconds"] / moment.h, len(memory))
+        late = 0.0
+        for k, sample in enumerate(samples):
+            late = late + jnp.where(whole == k, 1.0 - rest, jnp.where(whole == k - 1, rest, 0.0)) * sample
+        return late, samples[:-1]
+
+    def ahead(self, values: Values, memory: Memory, commands: Any, moment: Moment) -> tuple[Any, Memory]:
+        """Shifted by one bit of k after the other, so that nothing is looked up."""
+        back, count = len(memory), len(commands)
+        samples = jnp.concatenate([jnp.stack(memory[::-1]), commands])
+        whole, rest = _split(values["seconds"] / moment.h, back)
+        late, bit = jnp.concatenate([samples[:1], samples]), 1
+        whole = whole.astype(int)
+        while bit < back:
+            shifted = jnp.concatenate([jnp.broadcast_to(late[0], (bit,)), late[:-bit]])
+            late = jnp.where(whole & bit, shifted, late)
+            bit *= 2
+        new = late[-count:] + rest * (late[-count - 1 : -1] - late[-count:])
+        return new, tuple(samples[back - k : back - k + count] for k in range(back))
+
+
+def samples_back(h: float) -> int:
+    """How many earlier time steps are remembered."""
+    return min(math.ceil(LONGEST / h - 1e-9), MOST)
+
+
+def _split(steps: Scalar, back: int) -> tuple[Scalar, Scalar]:
+    """Whole and broken part of a number of time steps between 0 and `back`."""
+    steps = jnp.clip(steps, 0.0, float(back))
+    whole = jnp.minimum(jnp.floor(steps), back - 1.0)
+    return whole, steps - whole

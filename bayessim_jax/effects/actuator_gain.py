@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import mujoco
-
 from bayessim_jax.effects.contract import ActEffect, EffectParameter, Memory, Moment, Scales, Values
-from bayessim_jax.effects.places import actuators
 
 __all__ = ["ActuatorGain"]
 
@@ -16,10 +13,6 @@ class ActuatorGain(ActEffect):
     """u ↦ k u."""
 
     name = "actuator_gain"
-
-    def places(self, model: mujoco.MjModel) -> list[str]:
-        """Every actuator."""
-        return actuators(model)
 
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The gain k."""

@@ -5,10 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
-import mujoco
 
 from bayessim_jax.effects.contract import ActEffect, EffectParameter, Memory, Moment, Scales, Values
-from bayessim_jax.effects.places import actuators
 
 __all__ = ["ActuatorLag"]
 
@@ -21,10 +19,6 @@ class ActuatorLag(ActEffect):
     """
 
     name = "actuator_lag"
-
-    def places(self, model: mujoco.MjModel) -> list[str]:
-        """Every actuator."""
-        return actuators(model)
 
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The time constant T."""

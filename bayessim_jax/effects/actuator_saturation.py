@@ -6,10 +6,8 @@ import math
 from typing import Any
 
 import jax.numpy as jnp
-import mujoco
 
 from bayessim_jax.effects.contract import ActEffect, EffectParameter, Memory, Moment, Scales, Values
-from bayessim_jax.effects.places import actuators
 
 __all__ = ["ActuatorSaturation"]
 
@@ -18,10 +16,6 @@ class ActuatorSaturation(ActEffect):
     """u ↦ clip(u, ±u_max), in the unit of the command."""
 
     name = "actuator_saturation"
-
-    def places(self, model: mujoco.MjModel) -> list[str]:
-        """Every actuator."""
-        return actuators(model)
 
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The limit u_max; a fit begins where some commands are above it."""

@@ -31,8 +31,8 @@ def effect_places(effect: Any, system: System[Any]) -> list[str]:
         seen = {c.name for c in system.channels}
         return places if effect.port != "sense" else [p for p in places if p in seen]
     if effect.port == "act" and isinstance(system.actions, Box):
-        return [f"actuator/{name}" for name in system.actions.names]
-    return list(system.observations.names) if effect.port == "sense" else []
+        return [] if effect.looks else effect.choose(system.actions.names)
+    return list(system.observations.names) if effect.port == "sense" and not effect.remembers else []
 
 
 def with_effects(

@@ -23,6 +23,7 @@ from bayessim_jax.systems.mjcf import MjcfState, MjcfSystem
 __all__ = ["AugmentedMjcf", "AugmentedState", "Grip"]
 
 Actions = Float[Array, "periods act"]
+NONE: frozenset[int] = frozenset()
 
 
 @struct.dataclass
@@ -120,7 +121,11 @@ class AugmentedMjcf:
         first = jnp.zeros(self.actions.size, kind) if action is None else jnp.asarray(action, kind)
         held = first if past is None or not len(past) else jnp.asarray(past[0], kind)
         time = jnp.asarray(time, kind)
-        qpos, qvel = self._restore(theta, qpos, qvel, time)
+        if any(w.effect.remembers for _, w in self._at("sense")):
+            seen = AugmentedState(MjcfState(self.engine.init(inner, qpos, qvel), held), (), (), time)
+            qpos, qvel = self._restore(theta, qpos, qvel, time, self._push(inner, seen, held))
+        else:
+            qpos, qvel = self._restore(theta, qpos, qvel, time, jnp.zeros_like(qvel))
         physics = self.engine.init(inner, qpos, qvel)
         inertias = {
             joint: share * probe_inertia(self.engine, inner, self.base.qpos.astype(kind), self._dof(joint))
@@ -128,26 +133,11 @@ class AugmentedMjcf:
         }
         grips = tuple(Grip(qvel[self._dof(j)], jnp.zeros((), kind), m) for j, m in inertias.items())
         state = AugmentedState(MjcfState(physics, first), (), grips, time)
-        memories: list[Any] = [()] * len(self.effects)
-        commands: list[Number] = [held[k] for k in range(self.actions.size)]
-        for k, w in self._at("act"):
-            moment = self._actuator_moment(numbers, state, w.site)
-            memories[k] = _arrays(w.effect.begin(w.values(theta), _pick(commands, w.site), moment), time)
-            commands, _ = self._pass(theta, w, memories[k], commands, moment)
-        state = replace(state, memories=tuple(memories))
+        state = self._begin_commands(theta, numbers, state, held)
         if past is not None and len(past):
-            state = self._warm(theta, numbers, state, jnp.asarray(past, kind))
+            state = self._warm(theta, state, jnp.asarray(past, kind))
         commands, _ = self._commands(theta, numbers, state, first)
-        state = replace(state, grips=self._free(inner, state, commands))
-        memories = list(state.memories)
-        accelerations = self._accelerations(state)
-        for k, w in self._at("force"):
-            moment = self._joint_moment(numbers, state, w.site, commands, accelerations)
-            memories[k] = _arrays(w.effect.begin(w.values(theta), moment), time)
-        for k, w in self._at("sense"):
-            memory = w.effect.begin(w.values(theta), self._sensor_moment(state, w.site))
-            memories[k] = _arrays(memory, time)
-        return replace(state, memories=tuple(memories))
+        return self._begin_joints(theta, numbers, inner, state, commands)
 
     def step(self, theta: Float[Array, " d"], state: AugmentedState, action: Float[Array, " act"]) -> AugmentedState:
         """Advance by one control period."""
@@ -156,15 +146,22 @@ class AugmentedMjcf:
     def replay(self, theta: Float[Array, " d"], state: AugmentedState, actions: Actions) -> AugmentedState:
         """The states after each control period under recorded actions; a leading axis on every leaf."""
         numbers, inner = self._prepare(theta)
-        if self._runs_ahead():
-            return self._replay_ahead(theta, numbers, inner, state, actions)
-        period = self._period(theta, numbers, inner)
+        early = self._early()
+        if not early and self._only(early):
+            physics = self.engine.replay(inner, state.base.physics, actions, None, self.substeps)
+            return self._later(state, actions, physics)
+        rows, memories = self._pass_early(theta, state, actions, early) if early else (None, {})
+        if rows is not None and self._only(early):
+            return self._replay_rows(inner, state, actions, rows, memories)
+        period = self._period(theta, numbers, inner, early)
 
-        def once(state: AugmentedState, action: Float[Array, " act"]) -> tuple[AugmentedState, AugmentedState]:
-            after = period(state, action)
-            return after, after
+        def once(state: AugmentedState, now: Any) -> tuple[AugmentedState, AugmentedState]:
+            action, rows, memories = now
+            after = period(state, action, rows)
+            kept = tuple(memories.get(k, memory) for k, memory in enumerate(after.memories))
+            return after, replace(after, memories=kept)
 
-        return jax.lax.scan(once, state, actions)[1]
+        return jax.lax.scan(once, state, (actions, rows, memories))[1]
 
     def observe(self, theta: Float[Array, " d"], state: AugmentedState) -> Float[Array, " obs"]:
         """The channels in their order, as the sensors' effects show them."""
@@ -200,17 +197,30 @@ class AugmentedMjcf:
         return [k for k, c in enumerate(self.channels) if c.name == wired.place]
 
     def _period(
-        self, theta: Float[Array, " d"], numbers: Numbers, inner: Float[Array, " e"]
-    ) -> Callable[[AugmentedState, Float[Array, " act"]], AugmentedState]:
-        def period(state: AugmentedState, action: Float[Array, " act"]) -> AugmentedState:
-            if not any(w.effect.port != "model" for w in self.effects):
+        self, theta: Float[Array, " d"], numbers: Numbers, inner: Float[Array, " e"], early: frozenset[int] = NONE
+    ) -> Callable[..., AugmentedState]:
+        """One control period; commands that have passed the `early` effects come as rows, one for each time step."""
+
+        def period(
+            state: AugmentedState, action: Float[Array, " act"], rows: Float[Array, "steps act"] | None = None
+        ) -> AugmentedState:
+            if all(w.effect.port in ("model", "sense") for w in self.effects):
                 physics = self.engine.step(inner, state.base.physics, action, None, self.substeps)
-                return replace(state, base=MjcfState(physics, action), time=state.time + self.dt)
-            if self.substeps == 1:
-                return self._tick(theta, numbers, inner, state, action)
-            state = replace(state, base=replace(state.base, ctrl=action))
-            once = lambda s, _: (self._tick(theta, numbers, inner, s, action), None)  # noqa: E731
-            return jax.lax.scan(once, state, length=self.substeps)[0]
+                after = replace(state, base=MjcfState(physics, action), time=state.time + self.dt)
+            elif self.substeps == 1:
+                after = self._tick(theta, numbers, inner, state, action if rows is None else rows[0], early)
+            else:
+
+                def once(s: AugmentedState, row: Float[Array, " act"] | None) -> tuple[AugmentedState, None]:
+                    return self._tick(theta, numbers, inner, s, action if row is None else row, early), None
+
+                after = jax.lax.scan(once, state, rows, length=self.substeps)[0]
+            memories = list(after.memories)
+            for k, w in self._at("sense"):
+                if w.effect.remembers:
+                    moment = self._sensor_moment(after, w.site)._replace(h=self.dt)
+                    memories[k] = w.effect.track(w.values(theta), memories[k], moment)
+            return replace(after, base=replace(after.base, ctrl=action), memories=tuple(memories))
 
         return period
 
@@ -221,32 +231,33 @@ class AugmentedMjcf:
         inner: Float[Array, " e"],
         state: AugmentedState,
         action: Float[Array, " act"],
+        early: frozenset[int],
     ) -> AugmentedState:
         """One time step of the model."""
-        commands, memories = self._commands(theta, numbers, state, action)
+        commands, memories = self._commands(theta, numbers, state, action, early)
         forces, grips, memories = self._forces(theta, numbers, state, commands, memories)
         ctrl = jnp.stack(commands) if self._at("act") else action
         physics = self.engine.step(inner, state.base.physics, ctrl, forces, 1)
-        after = AugmentedState(MjcfState(physics, action), tuple(memories), grips, state.time + self._h)
-        for k, w in self._at("sense"):
-            if not w.effect.remembers:
-                continue
-            moment = self._sensor_moment(after, w.site)
-            reading = moment.velocity if w.place.endswith("/qvel") else moment.position
-            memories[k] = w.effect.track(w.values(theta), memories[k], reading, moment)
-        return replace(after, memories=tuple(memories))
+        return AugmentedState(replace(state.base, physics=physics), tuple(memories), grips, state.time + self._h)
 
     @property
     def _h(self) -> float:
         return float(self.engine.model.opt.timestep)
 
     def _commands(
-        self, theta: Float[Array, " d"], numbers: Numbers, state: AugmentedState, action: Float[Array, " act"]
+        self,
+        theta: Float[Array, " d"],
+        numbers: Numbers,
+        state: AugmentedState,
+        action: Float[Array, " act"],
+        early: frozenset[int] = NONE,
     ) -> tuple[list[Number], list[Any]]:
         """What arrives at the actuators during the next time step, and the memories after it."""
         commands: list[Number] = [action[k] for k in range(self.actions.size)]
         memories = list(state.memories)
         for k, w in self._at("act"):
+            if k in early:
+                continue
             moment = self._actuator_moment(numbers, state, w.site)
             commands, memories[k] = self._pass(theta, w, memories[k], commands, moment)
         return commands, memories
@@ -291,6 +302,55 @@ class AugmentedMjcf:
         )
         return jnp.stack([jnp.asarray(f, kind) for f in total]), grips, memories
 
+    def _begin_commands(
+        self, theta: Float[Array, " d"], numbers: Numbers, state: AugmentedState, held: Float[Array, " act"]
+    ) -> AugmentedState:
+        """Memories of the actuators' effects as after a command that has been held for long."""
+        memories: list[Any] = [()] * len(self.effects)
+        commands: list[Number] = [held[k] for k in range(self.actions.size)]
+        for k, w in self._at("act"):
+            moment = self._actuator_moment(numbers, state, w.site)
+            memories[k] = _arrays(w.effect.begin(w.values(theta), _pick(commands, w.site), moment), state.time)
+            commands, _ = self._pass(theta, w, memories[k], commands, moment)
+        return replace(state, memories=tuple(memories))
+
+    def _begin_joints(
+        self,
+        theta: Float[Array, " d"],
+        numbers: Numbers,
+        inner: Float[Array, " e"],
+        state: AugmentedState,
+        commands: list[Number],
+    ) -> AugmentedState:
+        """Memories of the other effects, from what the joints are about to do without anything that holds them."""
+        memories = list(state.memories)
+        remembering = [(k, w) for k, w in self._at("sense") if w.effect.remembers]
+        if self._at("force") or remembering:
+            kind = state.time.dtype
+            ctrl = jnp.stack([jnp.asarray(c, kind) for c in commands]) if commands else state.base.ctrl
+            acceleration = self._push(inner, state, ctrl)
+            for k, w in remembering:
+                moment = self._sensor_moment(state, w.site)._replace(h=self.dt)
+                moment = moment._replace(acceleration=acceleration[self._dof(w.site.joint)])
+                memories[k] = _arrays(w.effect.begin(w.values(theta), moment), state.time)
+            before = [
+                replace(grip, velocity=grip.velocity - self._h / CAUTION * acceleration[self._dof(joint)])
+                for (joint, _), grip in zip(self.shares, state.grips, strict=True)
+            ]
+            state = replace(state, grips=tuple(before))
+        accelerations = self._accelerations(state)
+        for k, w in self._at("force"):
+            moment = self._joint_moment(numbers, state, w.site, commands, accelerations)
+            memories[k] = _arrays(w.effect.begin(w.values(theta), moment), state.time)
+        return replace(state, memories=tuple(memories))
+
+    def _push(
+        self, inner: Float[Array, " e"], state: AugmentedState, ctrl: Float[Array, " act"]
+    ) -> Float[Array, " nv"]:
+        """Accelerations over one time step under a command, without the effects of forces."""
+        after = self.engine.step(inner, state.base.physics, ctrl, None, 1)
+        return (self.engine.qvel(after) - self.engine.qvel(state.base.physics)) / self._h
+
     def _accelerations(self, state: AugmentedState) -> dict[int, Number]:
         """What the joints did in the last time step, less what held them: a = (v − v⁻)/h − f⁻/m."""
         velocity = self.engine.qvel(state.base.physics)
@@ -298,20 +358,6 @@ class AugmentedMjcf:
             joint: (velocity[self._dof(joint)] - grip.velocity) / self._h - grip.held / grip.inertia
             for (joint, _), grip in zip(self.shares, state.grips, strict=True)
         }
-
-    def _free(self, inner: Float[Array, " e"], state: AugmentedState, commands: list[Number]) -> tuple[Grip, ...]:
-        """Grips that look back on what the joints are about to do without anything that holds them."""
-        if not any(w.effect.holds for _, w in self._at("force")):
-            return state.grips
-        kind = state.time.dtype
-        ctrl = jnp.stack([jnp.asarray(c, kind) for c in commands]) if commands else state.base.ctrl
-        before = self.engine.qvel(state.base.physics)
-        after = self.engine.qvel(self.engine.step(inner, state.base.physics, ctrl, None, 1))
-        dofs = [self._dof(joint) for joint, _ in self.shares]
-        change = [(after[dof] - before[dof]) / CAUTION for dof in dofs]
-        return tuple(
-            replace(grip, velocity=before[dof] - dv) for dof, dv, grip in zip(dofs, change, state.grips, strict=True)
-        )
 
     def _joint_moment(
         self,
@@ -351,7 +397,12 @@ class AugmentedMjcf:
         return Moment(state.time, self._h, q, self.engine.qvel(state.base.physics)[self._dof(site.joint)])
 
     def _restore(
-        self, theta: Float[Array, " d"], qpos: Float[Array, " nq"], qvel: Float[Array, " nv"], time: Scalar
+        self,
+        theta: Float[Array, " d"],
+        qpos: Float[Array, " nq"],
+        qvel: Float[Array, " nv"],
+        time: Scalar,
+        acceleration: Float[Array, " nv"],
     ) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
         """The state that these positions and velocities were measured in."""
         seen = {c.name for c in self.channels}
@@ -359,7 +410,7 @@ class AugmentedMjcf:
             if w.site.joint < 0:
                 continue
             q, v = int(self.engine.model.jnt_qposadr[w.site.joint]), self._dof(w.site.joint)
-            moment = Moment(time, self._h, qpos[q], qvel[v])
+            moment = Moment(time, self.dt, qpos[q], qvel[v], acceleration[v])
             position, velocity = w.effect.restore(w.values(theta), moment)
             if not w.place.endswith("/qvel"):
                 qpos = qpos.at[q].set(position)
@@ -367,58 +418,68 @@ class AugmentedMjcf:
                 qvel = qvel.at[v].set(velocity)
         return qpos, qvel
 
-    def _warm(
-        self, theta: Float[Array, " d"], numbers: Numbers, state: AugmentedState, past: Actions
-    ) -> AugmentedState:
+    def _warm(self, theta: Float[Array, " d"], state: AugmentedState, past: Actions) -> AugmentedState:
         """The memories of the actuators' effects after past commands; those that look at the joint are left alone."""
-        kept = {k for k, w in self._at("act") if not w.effect.looks}
-        if not kept:
-            return state
-        rows = jnp.repeat(past, self.substeps, axis=0) if self.substeps > 1 else past
-        start, count = state.time, rows.shape[0]
+        begun = replace(state, time=state.time - len(past) * self.dt)
+        blind = frozenset(k for k, w in self._at("act") if not w.effect.looks)
+        _, later = self._pass_early(theta, begun, past, blind)
+        last = jax.tree.map(lambda x: x[-1], later)
+        return replace(state, memories=tuple(last.get(k, memory) for k, memory in enumerate(state.memories)))
 
-        def once(carry: tuple[AugmentedState, Scalar], row: Float[Array, " act"]) -> Any:
-            state, left = carry
-            now = replace(state, time=start - left * self._h)
-            _, memories = self._commands(theta, numbers, now, row)
-            memories = [m if k in kept else state.memories[k] for k, m in enumerate(memories)]
-            return (replace(state, memories=tuple(memories)), left - 1.0), None
+    def _early(self) -> frozenset[int]:
+        """Effects of actuators that are worked out before the simulation: for one that hurries also those before it."""
+        blind: list[int] = []
+        for k, w in self._at("act"):
+            if w.effect.looks:
+                break
+            blind.append(k)
+        if self.engine.name == "mujoco" and self._only(frozenset(blind)):
+            return frozenset(blind)
+        while blind and not self.effects[blind[-1]].effect.hurries:
+            blind.pop()
+        return frozenset(blind)
 
-        (state, _), _ = jax.lax.scan(once, (state, jnp.asarray(float(count), state.time.dtype)), rows)
-        return replace(state, time=start)
+    def _only(self, early: frozenset[int]) -> bool:
+        """Whether nothing is left to do between time steps."""
+        others = [w.effect for k, w in enumerate(self.effects) if k not in early]
+        return all(e.port == "model" or (e.port == "sense" and not e.remembers) for e in others)
 
-    def _runs_ahead(self) -> bool:
-        """Whether all commands are known before the simulation begins, and one call of the engine is worth it."""
-        ports = {w.effect.port for w in self.effects}
-        looks = any(w.effect.looks for _, w in self._at("act"))
-        tracks = any(w.effect.remembers for _, w in self._at("sense"))
-        if looks or tracks or "force" in ports:
-            return False
-        return "act" not in ports or self.engine.name == "mujoco"
+    def _pass_early(
+        self, theta: Float[Array, " d"], state: AugmentedState, actions: Actions, early: frozenset[int]
+    ) -> tuple[Float[Array, "periods steps act"], dict[int, Any]]:
+        """What has become of the commands at each time step, and the memories after each period."""
+        rows = jnp.repeat(actions, self.substeps, axis=0) if self.substeps > 1 else actions
+        columns: list[Any] = [rows[:, k] for k in range(self.actions.size)]
+        later = {}
+        for k in sorted(early):
+            w, moment = self.effects[k], Moment(state.time, self._h)
+            new, memory = w.effect.ahead(w.values(theta), state.memories[k], _pick(columns, w.site), moment)
+            for actuator, value in zip(w.site.actuators, new if isinstance(new, tuple) else (new,), strict=True):
+                columns[actuator] = value
+            later[k] = jax.tree.map(lambda x: x[self.substeps - 1 :: self.substeps], memory)
+        return jnp.stack(columns, -1).reshape(-1, self.substeps, self.actions.size), later
 
-    def _replay_ahead(
+    def _replay_rows(
         self,
-        theta: Float[Array, " d"],
-        numbers: Numbers,
         inner: Float[Array, " e"],
         state: AugmentedState,
         actions: Actions,
+        rows: Float[Array, "periods steps act"],
+        memories: dict[int, Any],
     ) -> AugmentedState:
-        def once(state: AugmentedState, row: Float[Array, " act"]) -> Any:
-            commands, memories = self._commands(theta, numbers, state, row)
-            after = replace(state, memories=tuple(memories), time=state.time + self._h)
-            return after, (jnp.stack(commands), after)
+        """Known commands at each time step."""
+        flat = rows.reshape(-1, self.actions.size)
+        physics = self.engine.replay(inner, state.base.physics, flat, None, 1)
+        ends = jax.tree.map(lambda x: x[self.substeps - 1 :: self.substeps], physics)
+        later = self._later(state, actions, ends)
+        return replace(later, memories=tuple(memories.get(k, m) for k, m in enumerate(later.memories)))
 
-        if not self._at("act"):
-            physics = self.engine.replay(inner, state.base.physics, actions, None, self.substeps)
-            times = state.time + self.dt * jnp.arange(1, len(actions) + 1, dtype=state.time.dtype)
-            spread = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(actions), *x.shape)), state)
-            return replace(spread, base=MjcfState(physics, actions), time=times)
-        rows = jnp.repeat(actions, self.substeps, axis=0)
-        _, (commands, states) = jax.lax.scan(once, state, rows)
-        physics = self.engine.replay(inner, state.base.physics, commands, None, 1)
-        ends = lambda x: x[self.substeps - 1 :: self.substeps]  # noqa: E731
-        return jax.tree.map(ends, replace(states, base=MjcfState(physics, rows)))
+    def _later(self, state: AugmentedState, actions: Actions, physics: Any) -> AugmentedState:
+        """States at the ends of control periods between which nothing but the engine was at work."""
+        count = len(actions)
+        times = state.time + self.dt * jnp.arange(1, count + 1, dtype=state.time.dtype)
+        spread = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), state)
+        return replace(spread, base=MjcfState(physics, actions), time=times)
 
 
 def _pick(commands: list[Number], site: Site) -> Any:

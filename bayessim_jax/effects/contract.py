@@ -13,10 +13,11 @@ Everything is written for one place, one trajectory and one set of parameters, i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import jax
 import mujoco
 from jaxtyping import Array
 
@@ -170,7 +171,17 @@ class ActEffect(Effect, Protocol):
 
     port: str = "act"
     looks: bool = False
-    """Whether it looks at position or velocity; what does not can run ahead of the simulation."""
+    """Whether it looks at position or velocity; what does not can be worked out before the simulation."""
+    hurries: bool = False
+    """Whether `ahead` is quicker than `command` at every time step."""
+
+    def choose(self, names: Sequence[str]) -> list[str]:
+        """The places among actuators of these names: each of them, unless it takes several."""
+        return [f"actuator/{name}" for name in names]
+
+    def places(self, model: mujoco.MjModel) -> list[str]:
+        """Every actuator, unless `choose` chooses."""
+        return self.choose([model.actuator(i).name or f"actuator{i}" for i in range(model.nu)])
 
     def begin(self, values: Values, command: Any, moment: Moment) -> Memory:
         """The memory after this command has been held for long."""
@@ -179,6 +190,16 @@ class ActEffect(Effect, Protocol):
     def command(self, values: Values, memory: Memory, command: Any, moment: Moment) -> tuple[Any, Memory]:
         """What arrives in place of a command, on average over the time step, and the memory for the next one."""
         ...
+
+    def ahead(self, values: Values, memory: Memory, commands: Any, moment: Moment) -> tuple[Any, Memory]:
+        """The same for commands that are known beforehand, one for each time step: a leading axis on everything."""
+
+        def once(carry: tuple[Memory, Scalar], command: Any) -> Any:
+            memory, time = carry
+            new, memory = self.command(values, memory, command, moment._replace(time=time))
+            return (memory, time + moment.h), (new, memory)
+
+        return jax.lax.scan(once, (memory, moment.time), commands)[1]
 
 
 @runtime_checkable
@@ -204,14 +225,14 @@ class SenseEffect(Effect, Protocol):
 
     port: str = "sense"
     remembers: bool = False
-    """Whether it has a memory, which is then brought up to date at every time step."""
+    """Whether it has a memory, which is then brought up to date at the end of every control period."""
 
     def begin(self, values: Values, moment: Moment) -> Memory:
         """The memory in this state."""
         return ()
 
-    def track(self, values: Values, memory: Memory, reading: Scalar, moment: Moment) -> Memory:
-        """The memory after a time step that ended with this true reading."""
+    def track(self, values: Values, memory: Memory, moment: Moment) -> Memory:
+        """The memory after a control period of `moment.h` that ended in this state."""
         return memory
 
     def sense(self, values: Values, memory: Memory, reading: Scalar) -> Scalar:

@@ -5,10 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
-import mujoco
 
 from bayessim_jax.effects.contract import ActEffect, EffectParameter, Memory, Moment, Scales, Values
-from bayessim_jax.effects.places import actuators
 
 __all__ = ["GainDrop"]
 
@@ -21,10 +19,6 @@ class GainDrop(ActEffect):
     """
 
     name = "gain_drop"
-
-    def places(self, model: mujoco.MjModel) -> list[str]:
-        """Every actuator."""
-        return actuators(model)
 
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """t* and k."""
