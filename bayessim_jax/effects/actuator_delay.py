@@ -1,0 +1,73 @@
+"""A command that arrives late."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import jax.numpy as jnp
+
+from bayessim_jax.contracts import Scalar
+from bayessim_jax.effects.contract import ActEffect, EffectParameter, Memory, Moment, Scales, Values
+
+__all__ = ["ActuatorDelay"]
+
+LONGEST = 0.1
+"""The longest delay, s; what is remembered is as long."""
+MOST = 100
+"""The most time steps that are remembered, which makes the longest delay shorter where time steps are short."""
+
+
+class ActuatorDelay(ActEffect):
+    """u(t) ↦ u(t − T), T any fraction of a time step.
+
+    A command that is held from one time step to the next arrives, on average over a time step n, as
+    (1 − f) u[n − k] + f u[n − k − 1] with T/h = k + f. T in s, 0.1 at most.
+    """
+
+    name = "actuator_delay"
+    hurries = True
+
+    def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
+        """The delay T."""
+        high = scales.timestep * samples_back(scales.timestep)
+        return (EffectParameter("seconds", "s", 0.0, high, 0.0, min(0.02 + 0.37 * scales.timestep, 0.5 * high)),)
+
+    def begin(self, values: Values, command: Any, moment: Moment) -> Memory:
+        """The command as if it had always been the same, the latest first."""
+        return (command,) * samples_back(moment.h)
+
+    def command(self, values: Values, memory: Memory, command: Any, moment: Moment) -> tuple[Any, Memory]:
+        """The command T ago."""
+        samples = (command, *memory)
+        whole, rest = _split(values["seconds"] / moment.h, len(memory))
+        late = 0.0
+        for k, sample in enumerate(samples):
+            late = late + jnp.where(whole == k, 1.0 - rest, jnp.where(whole == k - 1, rest, 0.0)) * sample
+        return late, samples[:-1]
+
+    def ahead(self, values: Values, memory: Memory, commands: Any, moment: Moment) -> tuple[Any, Memory]:
+        """Shifted by one bit of k after the other, so that nothing is looked up."""
+        back, count = len(memory), len(commands)
+        samples = jnp.concatenate([jnp.stack(memory[::-1]), commands])
+        whole, rest = _split(values["seconds"] / moment.h, back)
+        late, bit = jnp.concatenate([samples[:1], samples]), 1
+        whole = whole.astype(int)
+        while bit < back:
+            shifted = jnp.concatenate([jnp.broadcast_to(late[0], (bit,)), late[:-bit]])
+            late = jnp.where(whole & bit, shifted, late)
+            bit *= 2
+        new = late[-count:] + rest * (late[-count - 1 : -1] - late[-count:])
+        return new, tuple(samples[back - k : back - k + count] for k in range(back))
+
+
+def samples_back(h: float) -> int:
+    """How many earlier time steps are remembered."""
+    return min(math.ceil(LONGEST / h - 1e-9), MOST)
+
+
+def _split(steps: Scalar, back: int) -> tuple[Scalar, Scalar]:
+    """Whole and broken part of a number of time steps between 0 and `back`."""
+    steps = jnp.clip(steps, 0.0, float(back))
+    whole = jnp.minimum(jnp.floor(steps), back - 1.0)
+    return whole, steps - whole

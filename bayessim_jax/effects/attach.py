@@ -1,0 +1,96 @@
+"""Putting effects into a simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from bayessim_jax.contracts import Box, System
+from bayessim_jax.effects.augmented import AugmentedMjcf
+from bayessim_jax.effects.commanded import AugmentedSystem, find_commands
+from bayessim_jax.effects.contract import Scales
+from bayessim_jax.effects.drive import least_share
+from bayessim_jax.effects.places import Site, find_site
+from bayessim_jax.effects.wiring import assign, extend_box, extend_writes
+from bayessim_jax.engines.choice import choose_engine
+from bayessim_jax.engines.contract import Engine
+from bayessim_jax.engines.fields import Write
+from bayessim_jax.engines.tree import TreeEngine
+from bayessim_jax.systems.channels import observed_sensors
+from bayessim_jax.systems.mjcf import MjcfSystem
+
+__all__ = ["effect_places", "with_effects"]
+
+
+def effect_places(effect: Any, system: System[Any]) -> list[str]:
+    """Where an effect can act in a system."""
+    if isinstance(system, (MjcfSystem, AugmentedMjcf)):
+        places = effect.places(system.engine.model)
+        seen = {c.name for c in system.channels}
+        return places if effect.port != "sense" else [p for p in places if p in seen]
+    if effect.port == "act" and isinstance(system.actions, Box):
+        return [] if effect.looks else effect.choose(system.actions.names)
+    return list(system.observations.names) if effect.port == "sense" and not effect.remembers else []
+
+
+def with_effects(
+    system: System[Any],
+    effects: Sequence[tuple[Any, str]],
+    scales: Scales | Mapping[str, Scales] | None = None,
+) -> Any:
+    """The system with effects at places, in their order: θ' = [θ, `stribeck_friction@joint/hinge/coulomb`, …].
+
+    `scales` holds for all places or for each by name. Effects of forces and of the model need an `MjcfSystem`; any
+    other system with continuous actions takes effects of its actuators and sensors. Raises `ValueError`.
+    """
+    scales = scales if scales is not None else Scales(period=system.dt, timestep=system.dt)
+    if isinstance(system, MjcfSystem):
+        return _augment(system, effects, scales)
+    for effect, place in effects:
+        if (
+            effect.port not in ("act", "sense")
+            or getattr(effect, "looks", False)
+            or getattr(effect, "remembers", False)
+        ):
+            raise ValueError(f"{effect.name}@{place}: only a system made of a MuJoCo model takes this effect.")
+    sites = [find_commands(system, p) if e.port == "act" else _observed(system, p) for e, p in effects]
+    wired = assign(effects, sites, scales, system.parameters.size)
+    return AugmentedSystem(extend_box(system.parameters, wired), system, wired)
+
+
+def _augment(
+    system: MjcfSystem, effects: Sequence[tuple[Any, str]], scales: Scales | Mapping[str, Scales]
+) -> AugmentedMjcf:
+    model, size = system.engine.model, system.parameters.size
+    sites = [find_site(model, place) for _, place in effects]
+    wired = assign(effects, sites, scales, size)
+    seen = {c.name for c in system.channels}
+    for w in wired:
+        if w.effect.port == "sense" and w.place not in seen:
+            raise ValueError(f"{w.effect.name}@{w.place}: this channel is not observed; observe it.")
+    edits = [w for w in wired if w.effect.port == "model"]
+    engine = system.engine
+    if edits:
+        engine = _rebuild(system, extend_writes(model, engine.writes, edits, size))
+    joints = dict.fromkeys(w.site.joint for w in wired if w.effect.port == "force" and w.site.joint >= 0)
+    shares = tuple((j, least_share(model, np.asarray(system.qpos), int(model.jnt_dofadr[j]))) for j in joints)
+    return AugmentedMjcf(extend_box(system.parameters, wired), system, engine, wired, shares)
+
+
+def _rebuild(system: MjcfSystem, writes: Sequence[Write]) -> Engine[Any]:
+    """The same engine with other writes."""
+    engine = system.engine
+    if isinstance(engine, TreeEngine):
+        return TreeEngine(engine.model, tuple(writes))
+    spec = getattr(getattr(engine, "bank", None), "spec", None)
+    return choose_engine(
+        engine.model, writes, engine.name, spec, observed_sensors(engine.model, system.channels)
+    ).engine
+
+
+def _observed(system: System[Any], place: str) -> Site:
+    if place not in system.observations.names:
+        raise ValueError(f"place {place!r}: the system observes {', '.join(system.observations.names)}.")
+    return Site()

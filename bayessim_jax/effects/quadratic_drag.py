@@ -1,0 +1,35 @@
+"""Drag of a body in a fluid."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import mujoco
+
+from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Scales, Values
+from bayessim_jax.effects.places import joints
+
+__all__ = ["QuadraticDrag"]
+
+
+class QuadraticDrag(ForceEffect):
+    """τ = −c v|v|.
+
+    c in N m s²/rad² or N s²/m². The force is that of the mean of before and after the time step,
+    −c v|v|/(1 + c|v| h/2m), which is stable for every c.
+    """
+
+    name = "quadratic_drag"
+
+    def places(self, model: mujoco.MjModel) -> list[str]:
+        """Every hinge and slide."""
+        return joints(model)
+
+    def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
+        """The coefficient c."""
+        high = 2.0 * scales.force / scales.speed**2
+        return (EffectParameter("coefficient", f"{scales.force_unit} s²/{scales.unit}²", 0.0, high, 0.0, 0.1 * high),)
+
+    def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
+        """−c v|v|."""
+        rate = values["coefficient"] * jnp.abs(moment.velocity)
+        return -rate * moment.velocity / (1.0 + rate * (0.5 * moment.h) / moment.inertia), memory

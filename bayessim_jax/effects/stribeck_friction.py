@@ -1,0 +1,45 @@
+"""Dry friction that is largest at rest."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import mujoco
+
+from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Scales, Values
+from bayessim_jax.effects.places import joints
+
+__all__ = ["StribeckFriction"]
+
+
+class StribeckFriction(ForceEffect):
+    """τ = −F(v) sign(v) in motion, at rest whatever holds the joint up to F_s.
+
+        F(v) = F_c + (F_s − F_c) exp(−(v/v_s)²)
+
+    τ = −clip(m (v/h + a), ±F(v)). F_c and F_s in N m or N, v_s in rad/s or m/s.
+
+    Source: Armstrong-Hélouvry, Dupont and Canudas de Wit 1994
+    """
+
+    name = "stribeck_friction"
+    holds = True
+
+    def places(self, model: mujoco.MjModel) -> list[str]:
+        """Every hinge and slide."""
+        return joints(model)
+
+    def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
+        """F_c, F_s and v_s."""
+        force, speed = scales.force, scales.speed
+        return (
+            EffectParameter("coulomb", scales.force_unit, 0.0, force, 0.0, 0.1 * force),
+            EffectParameter("static", scales.force_unit, 0.0, 1.5 * force, 0.0, 0.2 * force),
+            EffectParameter("velocity", f"{scales.unit}/s", 1e-3 * speed, speed, 0.1 * speed, 0.1 * speed, log=True),
+        )
+
+    def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
+        """Opposes motion, or holds."""
+        ratio = moment.velocity / values["velocity"]
+        coulomb = values["coulomb"]
+        level = coulomb + (values["static"] - coulomb) * jnp.exp(-ratio * ratio)
+        return -jnp.clip(moment.stop, -level, level), memory
