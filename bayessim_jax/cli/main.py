@@ -24,6 +24,8 @@ commands:
   new CASE        make a case folder from a MuJoCo model (bayessim new --help)
   check CASE      print what a case holds and what is wrong with it
   infer CASE      infer a model's parameters from recordings (bayessim infer --help)
+  diagnose CASE   say whether physics is missing in a model, where and which (bayessim diagnose --help)
+  evaluate RUN    score a diagnosis on other recordings (bayessim evaluate --help)
   report RUN      write the report of a run folder again
   systems         what can be identified: parameters, units, priors
 
@@ -32,7 +34,7 @@ options:
   --version       show the version
   --citations     BibTeX of what this package builds on (bayessim --citations RUN: of what that run used)
 """
-COMMANDS = ("online", "new", "check", "infer", "report", "systems")
+COMMANDS = ("online", "new", "check", "infer", "diagnose", "evaluate", "report", "systems")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -78,6 +80,14 @@ def _dispatch(words: list[str]) -> int:
         from bayessim_jax.cli.infer import infer
 
         return infer(rest)
+    if first == "diagnose":
+        from bayessim_jax.cli.diagnose import diagnose
+
+        return diagnose(rest)
+    if first == "evaluate":
+        from bayessim_jax.cli.evaluate import evaluate
+
+        return evaluate(rest)
     if first == "report":
         from bayessim_jax.cli.report import report
 

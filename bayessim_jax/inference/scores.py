@@ -12,7 +12,16 @@ from jaxtyping import Array, Bool, Float
 
 from bayessim_jax.inference.shooting import Predict, Ridge, Shots
 
-__all__ = ["Errors", "Score", "predict_windows", "prediction_errors", "score", "smallest_error"]
+__all__ = [
+    "Errors",
+    "Score",
+    "compare",
+    "error_spread",
+    "predict_windows",
+    "prediction_errors",
+    "score",
+    "smallest_error",
+]
 
 BINS = 8
 """Stretches of lead time over which the spread of errors is estimated."""
@@ -63,34 +72,54 @@ _predict = jax.jit(_predict_all, static_argnums=0)
 
 def prediction_errors(predict: Predict, shots: Shots, z: Float[Array, " d"]) -> Errors:
     """Measured minus predicted in every row after a window's first; windows that diverge are left out and counted."""
-    predicted, y, measured = predict_windows(predict, shots, z), np.asarray(shots.y), np.asarray(shots.measured)
+    return compare(predict_windows(predict, shots, z), np.asarray(shots.y), np.asarray(shots.measured))
+
+
+def compare(
+    predicted: Float[np.ndarray, "windows rows obs"],
+    y: Float[np.ndarray, "windows rows obs"],
+    measured: Bool[np.ndarray, "windows rows obs"],
+) -> Errors:
+    """The same for predictions that are there already."""
     lost = np.asarray(~np.isfinite(np.where(measured, predicted, 0.0)).all((1, 2)))
     measured = measured & ~lost[:, None, None]
     measured[:, 0] = False
     return Errors(np.where(measured, y - np.nan_to_num(predicted), 0.0), measured, int(lost.sum()))
 
 
-def score(errors: Errors, reference: Errors, scale: Float[np.ndarray, " obs"], channels: tuple[str, ...]) -> Score:
-    """Score errors; the Gaussian's spread comes from the `reference` errors, made on other recordings.
+def error_spread(errors: Errors, scale: Float[np.ndarray, " obs"]) -> Float[np.ndarray, "bins obs"]:
+    """Root mean square of errors over their channel's scale, for stretches of lead time; 1 where there are none."""
+    spreads = []
+    for rows in _stretches(errors):
+        counts = errors.measured[:, rows].sum((0, 1))
+        squares = (errors.error[:, rows] ** 2).sum((0, 1)) / np.maximum(counts, 1)
+        spreads.append(np.where(counts > 0, np.sqrt(squares) / scale, 1.0))
+    return np.maximum(np.array(spreads), 1e-6)
+
+
+def _stretches(errors: Errors) -> list[np.ndarray]:
+    return np.array_split(np.arange(errors.error.shape[1]), BINS)
+
+
+def score(
+    errors: Errors,
+    spread: Float[np.ndarray, "bins obs"],
+    scale: Float[np.ndarray, " obs"],
+    channels: tuple[str, ...],
+) -> Score:
+    """Score errors by a Gaussian of this `spread` (`error_spread`), which comes from other recordings.
 
     `scale` is the standard deviation of every channel.
     """
     counts = errors.measured.sum((0, 1))
     rms = np.sqrt((errors.error**2).sum((0, 1)) / np.maximum(counts, 1))
-    seen = np.flatnonzero(counts > 0)
-    per_channel = {c: float(rms[k] / scale[k]) for k, c in enumerate(channels) if k in seen}
-    logs, total = 0.0, 0
-    for rows in np.array_split(np.arange(errors.error.shape[1]), BINS):
-        for k in seen:
-            mask, known = errors.measured[:, rows, k], reference.measured[:, rows, k]
-            e, r = errors.error[:, rows, k][mask], reference.error[:, rows, k][known]
-            if not e.size:
-                continue
-            variance = ((r**2).mean() if r.size else scale[k] ** 2) / scale[k] ** 2 + 1e-12
-            logs += float((-0.5 * (e / scale[k]) ** 2 / variance - 0.5 * np.log(2 * np.pi * variance)).sum())
-            total += e.size
+    per_channel = {c: float(rms[k] / scale[k]) for k, c in enumerate(channels) if counts[k]}
+    logs = 0.0
+    for rows, sd in zip(_stretches(errors), spread, strict=True):
+        z = errors.error[:, rows] / scale / sd
+        logs += float(np.where(errors.measured[:, rows], -0.5 * z**2 - np.log(sd * np.sqrt(2 * np.pi)), 0.0).sum())
     nrmse = float(np.mean(list(per_channel.values()))) if per_channel else float("nan")
-    return Score(nrmse, logs / max(total, 1), per_channel, errors.diverged)
+    return Score(nrmse, logs / max(int(counts.sum()), 1), per_channel, errors.diverged)
 
 
 def smallest_error(

@@ -141,7 +141,7 @@ def eliminate(c: Curvature, damping: Scalar | float = 0.0) -> tuple[Array, Array
     return precision, gradient, toward, shift
 
 
-@partial(jax.jit, static_argnames=("predict", "steps", "step"))
+@partial(jax.jit, static_argnames=("predict", "step"))
 def solve(
     predict: Predict,
     shots: Shots,
@@ -150,10 +150,10 @@ def solve(
     sigma: Float[Array, " obs"],
     free: Bool[Array, " d"],
     *,
-    steps: int = 30,
+    steps: int | Int[Array, ""] = 30,
     step: float = 0.0,
-    tolerance: float = 1e-7,
-    damping: float = 1e-3,
+    tolerance: float | Scalar = 1e-7,
+    damping: float | Scalar = 1e-3,
 ) -> Fit:
     """Levenberg-Marquardt on (z, δ₁, …, δ_W) from a starting point; z stays as it is where it is not `free`.
 
@@ -163,41 +163,46 @@ def solve(
     kind = jnp.result_type(z)
     z, delta, sigma = z.astype(kind), delta.astype(kind), sigma.astype(kind)
 
-    def at(z: Array, delta: Array) -> Curvature:
-        return linearize(predict, shots, z, delta, sigma, step=step)
+    d, n, windows = z.size, delta.shape[-1], delta.shape[0]
+    held = jnp.outer(free, free)
+    zero = jnp.zeros((), kind)
+    nothing = Curvature(
+        cost=zero + jnp.inf,
+        hessian=jnp.zeros((d, d), kind),
+        gradient=jnp.zeros(d, kind),
+        own=jnp.zeros((windows, n, n), kind),
+        cross=jnp.zeros((windows, n, d), kind),
+        own_gradient=jnp.zeros((windows, n), kind),
+    )
 
     def body(carry: Any) -> Any:
-        z, delta, here, damping, count, small = carry
-        held = jnp.outer(free, free)
-        precision, gradient, toward, shift = eliminate(here, damping)
-        precision = jnp.where(held, precision, jnp.eye(z.size))
-        precision = precision + damping * jnp.diag(jnp.diagonal(here.hessian))
-        move = jnp.where(free, jnp.linalg.solve(precision, jnp.where(free, gradient, 0.0)), 0.0)
-        move = move * jnp.minimum(1.0, 2.0 / jnp.maximum(jnp.abs(move).max(initial=0.0), 1e-12))
-        moves = (shift - toward @ move) * shots.spread
-        there = at(z + move, delta + moves)
+        tried, kept, here, damping, count, small = carry
+        there = linearize(predict, shots, *tried, sigma, step=step)
         sound = jnp.isfinite(there.cost) & jnp.isfinite(there.gradient).all() & jnp.isfinite(there.hessian).all()
         better = sound & (there.cost <= here.cost)
         gain = jnp.where(better, (here.cost - there.cost) / jnp.maximum(jnp.abs(here.cost), 1e-12), 1.0)
-        pick = lambda a, b: jax.tree.map(lambda x, y: jnp.where(better, x, y), a, b)  # noqa: E731
-        z, delta, here = pick((z + move, delta + moves, there), (z, delta, here))
+        gain = jnp.where(jnp.isfinite(gain), gain, 1.0)
+        (z, delta), here = jax.tree.map(lambda x, y: jnp.where(better, x, y), (tried, there), (kept, here))
         damping = jnp.where(better, jnp.maximum(damping / 5, 1e-9), damping * 8)
+        precision, gradient, toward, shift = eliminate(here, damping)
+        precision = jnp.where(held, precision, jnp.eye(d)) + damping * jnp.diag(jnp.diagonal(here.hessian))
+        move = jnp.where(free, jnp.linalg.solve(precision, jnp.where(free, gradient, 0.0)), 0.0)
+        move = move * jnp.minimum(1.0, 2.0 / jnp.maximum(jnp.abs(move).max(initial=0.0), 1e-12))
+        moves = (shift - toward @ move) * shots.spread
         small = jnp.where(better & (gain < tolerance), small + 1, jnp.where(better, 0, small))
-        return z, delta, here, damping.astype(kind), count + 1, small
+        return (z + move, delta + moves), (z, delta), here, damping.astype(kind), count + 1, small
 
     def more(carry: Any) -> Any:
-        _, _, _, damping, count, small = carry
-        return (count < steps) & (small < 2) & (damping < 1e9)
+        _, _, here, damping, count, small = carry
+        return (count < steps) & (small < 2) & (damping < 1e9) & (jnp.isfinite(here.cost) | (count == 0))
 
-    start = at(z, delta)
-    z, delta, here, last, count, small = jax.lax.while_loop(
-        more, body, (z, delta, start, jnp.asarray(damping, kind), jnp.array(0), jnp.array(0))
-    )
+    start = ((z, delta), (z, delta), nothing, jnp.asarray(damping, kind), jnp.array(0), jnp.array(0))
+    _, (z, delta), here, last, count, small = jax.lax.while_loop(more, body, start)
     return Fit(
         z=z,
         delta=delta,
         sigma=sigma,
-        precision=eliminate(here)[0],
+        precision=jnp.where(held, eliminate(here)[0], jnp.eye(d)),
         cost=here.cost,
         steps=count,
         converged=(small >= 2) | (last >= 1e9),

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from bayessim_jax.inference.direct import DirectPosterior, fit_direct, sample_direct
 from bayessim_jax.inference.identifiability import Identifiability, find_unidentified
-from bayessim_jax.inference.scores import Score, predict_windows, prediction_errors, score, smallest_error
+from bayessim_jax.inference.scores import Score, error_spread, predict_windows, prediction_errors, score, smallest_error
 from bayessim_jax.inference.shooting import Fit, Shots, ridge
 from bayessim_jax.recordings.shots import CaseModel, case_model, predictor, split_windows
 from bayessim_jax.recordings.windows import Windows
@@ -127,8 +127,8 @@ def infer_case(
     scores, predictions = {}, {}
     for name, z in points.items():
         predictions[name] = predict_windows(predict, left, z)
-        reference = prediction_errors(predict, shots, z)
-        scores[name] = score(prediction_errors(predict, left, z), reference, scale, model.channels)
+        spread = error_spread(prediction_errors(predict, shots, z), scale)
+        scores[name] = score(prediction_errors(predict, left, z), spread, scale, model.channels)
     band = np.stack([predict_windows(predict, left, z) for z in posterior.z[:: max(draws // BAND, 1)][:BAND]])
     around = ridge(predict, shots, fit, step=model.step)
     return CaseInference(

@@ -11,6 +11,7 @@ import xarray as xr
 from jaxtyping import Float
 
 from bayessim_jax import __version__
+from bayessim_jax.recordings.evaluation import write_state
 from bayessim_jax.recordings.files import replace_file, to_json, write_text
 from bayessim_jax.recordings.loading import LoadedCase, load_case
 from bayessim_jax.recordings.mjcf import referenced_files
@@ -20,9 +21,10 @@ from bayessim_jax.recordings.run_folder import RunFolder
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from bayessim_jax.recordings.diagnosing import CaseDiagnosis
     from bayessim_jax.recordings.identification import CaseInference
 
-__all__ = ["sample_models", "write_inference", "write_model"]
+__all__ = ["sample_models", "write_diagnosis", "write_inference", "write_model"]
 
 PRIOR_DRAWS = 2000
 
@@ -45,6 +47,48 @@ def write_model(path: Path, case: LoadedCase, values: Mapping[str, float]) -> No
             place.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file, place)
     write_text(path, spec.to_xml())
+
+
+def write_diagnosis(folder: RunFolder, diagnosis: CaseDiagnosis, seed: int) -> None:
+    """Write `diagnosis.json`, `posterior.nc`, `simulators.json` and, where MJCF can say it, `model_augmented.xml`."""
+    write_text(folder.path / "diagnosis.json", to_json(diagnosis.table(), indent=2) + "\n")
+    write_state(folder, diagnosis)
+    _write_laplace(folder.path / "posterior.nc", diagnosis, seed)
+    theta, _ = diagnosis.theta["augmented"]
+    values = dict(zip(diagnosis.model.margins.names, theta.tolist(), strict=True))
+    if diagnosis.result.verdict == "no_mismatch":
+        write_model(folder.path / "model_augmented.xml", diagnosis.model.case, values)
+
+
+def _write_laplace(path: Path, diagnosis: CaseDiagnosis, seed: int) -> None:
+    """Groups `prior` and `posterior`: the case's parameters and those of the effects found, by Laplace."""
+    bench, entry, margins = diagnosis.bench, diagnosis.result.best, diagnosis.model.margins
+    named = diagnosis.result.verdict in ("explained", "ambiguous")
+    entry = entry if named else diagnosis.result.baseline
+    rng = np.random.default_rng(seed)
+    columns = bench.columns(entry.candidate)
+    size = bench.d + len(columns)
+    covariance = np.linalg.inv(np.asarray(entry.fit.precision)[:size, :size])
+    z = rng.multivariate_normal(np.asarray(entry.fit.z)[:size], covariance, PRIOR_DRAWS)
+    names = [*margins.names, *(variable(name) for name in bench.values(entry.candidate, entry.fit.z))]
+    units = [*margins.units, *(bench.parameters[i].unit for i in columns)]
+    each = [*margins.each, *(bench.each[i] for i in columns)]
+
+    def group(z: np.ndarray) -> xr.Dataset:
+        draws = {
+            name: (("chain", "draw"), np.asarray(margin.value(z[:, k]))[None], {"units": unit})
+            for k, (name, unit, margin) in enumerate(zip(names, units, each, strict=True))
+        }
+        return xr.Dataset(draws)
+
+    attributes = {
+        "title": f"Diagnosis of {diagnosis.model.case.case.name}: {diagnosis.result.verdict}",
+        "inference_library": "bayessim_jax",
+        "inference_library_version": __version__,
+    }
+    groups = {"prior": group(rng.standard_normal((PRIOR_DRAWS, size))), "posterior": group(z)}
+    tree = xr.DataTree.from_dict({"/": xr.Dataset(attrs=attributes), **groups})
+    replace_file(path, lambda temporary: tree.to_netcdf(temporary, engine=ENGINE))
 
 
 def _write_posterior(path: Path, result: CaseInference, seed: int) -> None:

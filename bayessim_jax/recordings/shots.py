@@ -7,39 +7,25 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from bayessim_jax.beliefs.margins import Margin, Margins, log_normal, normal, uniform
+from bayessim_jax.inference.replay import Inputs, make_predictor
 from bayessim_jax.inference.shooting import Shots
 from bayessim_jax.recordings.priors import LogNormal, Normal, Prior
 from bayessim_jax.recordings.recording import CaseRecording, resample
 from bayessim_jax.recordings.windows import Windows, stack_windows
-from bayessim_jax.systems.mjcf import MjcfSystem, Unknown, displace, mjcf_system
+from bayessim_jax.systems.mjcf import MjcfSystem, Unknown, mjcf_system
 
 if TYPE_CHECKING:
     from bayessim_jax.recordings.loading import LoadedCase
 
-__all__ = ["CaseModel", "Inputs", "case_model", "margin_of", "margins_of", "predictor", "split_windows", "take"]
+__all__ = ["CaseModel", "case_model", "margin_of", "margins_of", "predictor", "split_windows", "take"]
 
 JITTER = 0.02
 """Share of a step by which rows may lie off a uniform grid before a recording is put on one."""
-
-
-@struct.dataclass
-class Inputs:
-    """What the simulation of one window needs."""
-
-    qpos: Float[Array, " nq"]
-    qvel: Float[Array, " nv"]
-    ctrl: Float[Array, "steps nu"]
-    past: Float[Array, "before nu"]
-    """Commands of the rows before the window, the last one just before it."""
-    time: Float[Array, ""]
-    """When the window begins, s in its recording."""
 
 
 def margins_of(case: LoadedCase) -> Margins:
@@ -187,20 +173,7 @@ def _bounds(prior: Prior) -> tuple[float, float]:
 
 def predictor(model: CaseModel) -> Callable[[Array, Array, Inputs], Array]:
     """`predict(z, δ, window)` of a case: what its sensors show in every row of a window."""
-    system, margins, mujoco_model = model.system, model.margins, model.system.engine.model
-    nv = mujoco_model.nv
-
-    def predict(z: Array, delta: Array, window: Inputs) -> Array:
-        theta = margins.theta(z)
-        qpos = displace(mujoco_model, window.qpos, delta[:nv])
-        state = system.begin(theta, qpos, window.qvel + delta[nv:])
-        if window.ctrl.shape[-1]:
-            state = dataclasses.replace(state, ctrl=window.ctrl[0])
-        after = system.replay(theta, state, window.ctrl)
-        first = system.observe(theta, state)
-        return jnp.concatenate([first[None], jax.vmap(system.observe, in_axes=(None, 0))(theta, after)])
-
-    return predict
+    return make_predictor(model.system, model.margins)
 
 
 def split_windows(model: CaseModel) -> tuple[Windows, Windows]:

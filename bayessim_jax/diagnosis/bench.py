@@ -1,0 +1,201 @@
+"""The bench on which candidates are tried: one simulator that holds every effect at every place, most of them neutral.
+
+An effect at its neutral parameters changes nothing, bit for bit. So the simulator with all candidates in it is each of
+them in turn, and the one without any: it is traced and compiled once, and a candidate is a choice of which parameters
+are free. θ and the initial states of all windows are refitted with every candidate.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from bayessim_jax.beliefs.margins import Margin, Margins, log_uniform, uniform
+from bayessim_jax.effects import Scales, at, with_effects
+from bayessim_jax.inference.replay import Inputs, replay_window
+from bayessim_jax.inference.shooting import Fit, Shots, expand, solve
+from bayessim_jax.systems.mjcf import MjcfSystem
+
+__all__ = ["Bench", "Candidate", "Trial"]
+
+SLOTS = 6
+"""Parameters that a candidate may have beside θ."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Effects, by their numbers on the bench; none is the simulator as it is."""
+
+    effects: tuple[int, ...] = ()
+
+    def __add__(self, other: Candidate) -> Candidate:
+        return Candidate(tuple(sorted({*self.effects, *other.effects})))
+
+
+@struct.dataclass
+class Tried:
+    """A window, and which parameters are free in it."""
+
+    window: Inputs
+    index: Int[Array, " k"]
+    """Where the free parameters stand in [θ, effects' parameters, a place for those that are not used]."""
+    on: Bool[Array, " e"]
+    """Which of the effects' parameters are not neutral."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A candidate that was fitted."""
+
+    candidate: Candidate
+    fit: Fit
+    log_likelihood: float
+    """Of the windows it was fitted to, at its own noise, initial states profiled out."""
+
+
+class Bench:
+    """Every effect at every place of a system, windows of recordings, and the solver that fits them."""
+
+    def __init__(
+        self,
+        system: MjcfSystem,
+        margins: Margins,
+        pairs: Sequence[tuple[Any, str]],
+        scales: Mapping[str, Scales],
+        shots: Shots,
+        step: float = 0.0,
+        slots: int = SLOTS,
+    ) -> None:
+        self.margins, self.pairs, self.step, self.slots = margins, tuple(pairs), step, slots
+        self.scales = scales
+        self.union = with_effects(system, self.pairs, scales) if self.pairs else system
+        self.channels = tuple(c.name for c in system.channels)
+        self.shots = shots
+        wired = self.union.effects if self.pairs else ()
+        self.parameters = [p for w in wired for p in w.parameters]
+        self.first = np.cumsum([0, *(len(w.parameters) for w in wired)])
+        self.each: list[Margin] = [
+            log_uniform(p.low, p.high) if p.log else uniform(p.low, p.high) for p in self.parameters
+        ]
+        self.neutral = np.array([p.neutral for p in self.parameters])
+
+    @property
+    def d(self) -> int:
+        """Parameters of the system."""
+        return self.margins.size
+
+    @property
+    def size(self) -> int:
+        """Numbers that a fit finds: θ, and as many more as a candidate may have."""
+        return self.d + self.slots
+
+    def name(self, effect: int) -> str:
+        """`coulomb_friction@joint/hinge`."""
+        found, place = self.pairs[effect]
+        return f"{found.name}@{at(place)}"
+
+    def names(self, candidate: Candidate) -> list[str]:
+        """Of every effect of a candidate."""
+        return [self.name(k) for k in candidate.effects]
+
+    def columns(self, candidate: Candidate) -> list[int]:
+        """Numbers of a candidate's parameters among those of all effects."""
+        return [i for k in candidate.effects for i in range(self.first[k], self.first[k + 1])]
+
+    def fits(self, candidate: Candidate) -> bool:
+        """Whether it has no more parameters than there are places for."""
+        return len(self.columns(candidate)) <= self.slots
+
+    def setup(self, candidate: Candidate, measured: Bool[Array, "windows rows obs"] | None = None) -> Shots:
+        """The windows with a candidate's parameters free; only what is `measured` counts."""
+        columns = self.columns(candidate)
+        unused = self.d + len(self.parameters)
+        index = np.concatenate([np.arange(self.d), self.d + np.array(columns, int)])
+        index = np.concatenate([index, np.full(self.size - len(index), unused)]).astype(int)
+        on = np.isin(np.arange(len(self.parameters)), columns)
+        windows = self.shots.y.shape[0]
+        inputs = Tried(
+            self.shots.inputs,
+            jnp.broadcast_to(jnp.asarray(index), (windows, index.size)),
+            jnp.broadcast_to(jnp.asarray(on), (windows, on.size)),
+        )
+        mask = self.shots.measured if measured is None else measured
+        return dataclasses.replace(self.shots, inputs=inputs, measured=mask)
+
+    def starts(self, candidate: Candidate, z: Float[Array, " d"]) -> list[Float[Array, " k"]]:
+        """Points to begin from: θ as given, the effects at their start values, and mirrored in their ranges."""
+        columns = self.columns(candidate)
+        begin = np.array([float(self.each[i].standard(jnp.asarray(self.parameters[i].start, float))) for i in columns])
+        rest = np.zeros(self.slots - len(columns))
+        both = [begin] if not columns else [begin, -begin]
+        return [jnp.concatenate([z, jnp.asarray(x), jnp.asarray(rest)]) for x in both]
+
+    def free(self, candidate: Candidate) -> Bool[Array, " k"]:
+        """Which of the numbers that a fit finds are free."""
+        return jnp.arange(self.size) < self.d + len(self.columns(candidate))
+
+    @cached_property
+    def predict(self) -> Any:
+        """`predict(x, δ, tried)`; the same function for every candidate."""
+        d, neutral, margins, union = self.d, jnp.asarray(self.neutral), self.margins, self.union
+        each = self.each
+
+        def predict(x: Array, delta: Array, tried: Tried) -> Array:
+            z = jnp.zeros(d + len(each) + 1, x.dtype).at[tried.index].set(x)
+            theta = margins.theta(z[:d])
+            if each:
+                values = jnp.stack([m.value(z[d + k]) for k, m in enumerate(each)])
+                theta = jnp.concatenate([theta, jnp.where(tried.on, values, neutral)])
+            return replay_window(union, theta, delta, tried.window)
+
+        return predict
+
+    def values(self, candidate: Candidate, x: Float[Array, " k"]) -> dict[str, float]:
+        """The effects' parameters in physical units, `coulomb_friction@joint/hinge/coulomb`."""
+        named = {}
+        for k in candidate.effects:
+            for i in range(self.first[k], self.first[k + 1]):
+                place = self.columns(candidate).index(i)
+                value = float(self.each[i].value(x[self.d + place]))
+                named[f"{self.name(k)}/{self.parameters[i].name}"] = value
+        return named
+
+    def fit(
+        self,
+        candidate: Candidate,
+        x: Float[Array, " k"],
+        delta: Float[Array, "windows n"],
+        sigma: Float[Array, " obs"],
+        measured: Bool[Array, "windows rows obs"],
+        *,
+        steps: int = 12,
+        only_states: bool = False,
+    ) -> Fit:
+        """Fit a candidate from a point; with `only_states` x stays and the initial states alone are fitted."""
+        free = self.free(candidate) & (not only_states)
+        shots = self.setup(candidate, measured)
+        return solve(self.predict, shots, x, delta, sigma, free, steps=jnp.asarray(steps), step=self.step)
+
+    def look(self, candidate: Candidate, fit: Fit, measured: Bool[Array, "windows rows obs"]) -> tuple[Array, Array]:
+        """Residuals in the channels' units, and the derivatives of predictions along the initial states over S."""
+        shots = self.setup(candidate, measured)
+        return _look(self.predict, shots, fit.z, fit.delta, self.step)
+
+
+@partial(jax.jit, static_argnames=("predict", "step"))
+def _look(predict: Any, shots: Shots, x: Array, delta: Array, step: float) -> tuple[Array, Array]:
+    def states(_: Array, delta: Array, tried: Tried) -> Array:
+        return predict(x, delta, tried)
+
+    ones = jnp.ones(shots.y.shape[-1])
+    r, slopes = expand(states, shots, jnp.zeros(0), delta, ones, step)
+    return r.reshape(shots.y.shape), slopes

@@ -1,0 +1,328 @@
+"""The diagnosis: detect, name, decide. Arrays in, a verdict out; what reads cases and writes files stands above it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from bayessim_jax.diagnosis.bench import Bench, Candidate
+from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, Misfit, judge_misfit
+from bayessim_jax.inference.direct import noise_floor
+from bayessim_jax.inference.shooting import Fit
+
+__all__ = ["CONTAINS", "Diagnosis", "Entry", "Thresholds", "diagnose", "enter", "share_left"]
+
+CONTAINS = {
+    "stribeck_friction": ("coulomb_friction",),
+    "asymmetric_friction": ("coulomb_friction",),
+    "load_dependent_friction": ("coulomb_friction",),
+    "lugre_friction": ("coulomb_friction", "stribeck_friction"),
+    "gain_drop": ("actuator_gain",),
+    "gain_drift": ("actuator_gain",),
+    "payload": ("link_offset",),
+}
+"""Effects that have others as special cases: where both do as well, the simpler one is the finding."""
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """What decides; set on made-up worlds by `scripts/set_thresholds.py`, with whole families of effects left out."""
+
+    negligible: float = 0.02
+    """Share of the baseline's residual variance: what a candidate that removes less is not worth."""
+    left: float = 0.15
+    """Share of the baseline's misfit that an explanation may leave."""
+    tie: float = 2.0
+    """Standard errors within which two candidates predict held-out windows alike."""
+    least: float = 4.0
+    """Nats in all by which a candidate has to be worse to be out of the confusion set."""
+
+
+@dataclass
+class Entry:
+    """A candidate, fitted to all windows that choose, and scored on windows that its fit did not see."""
+
+    candidate: Candidate
+    names: list[str]
+    fit: Fit
+    scores: Float[np.ndarray, " windows"]
+    """Log predictive density of every window, its initial state profiled out."""
+    misfit: Misfit
+    variance: Float[np.ndarray, " obs"]
+    """Of held-out residuals."""
+
+    @property
+    def score(self) -> float:
+        """Sum over windows."""
+        return float(self.scores.sum())
+
+
+@dataclass
+class Diagnosis:
+    """What was found."""
+
+    verdict: str
+    baseline: Entry
+    entries: list[Entry]
+    """Candidates that came to the end, best first."""
+    confusion: list[Entry] = field(default_factory=list)
+    screened: list[tuple[str, float]] = field(default_factory=list)
+    """Every candidate and how much it gained on the windows it was fitted to."""
+
+    @property
+    def best(self) -> Entry:
+        """What the verdict names, or the best there was."""
+        return self.confusion[0] if self.confusion else self.entries[0] if self.entries else self.baseline
+
+
+@dataclass
+class _Work:
+    """Everything that the steps share."""
+
+    key: PRNGKeyArray
+    bench: Bench
+    group: Int[np.ndarray, " windows"]
+    chosen: Bool[np.ndarray, " windows"]
+    floor: Array
+    say: Callable[[str], None]
+
+    def mask(self, which: Bool[np.ndarray, " windows"]) -> Array:
+        """What was measured in some of the windows."""
+        return self.bench.shots.measured & jnp.asarray(which)[:, None, None]
+
+    def noise(self, squares: np.ndarray, which: np.ndarray, fitted: int) -> Array:
+        """Noise from the squared residuals of some windows."""
+        measured = np.asarray(self.bench.shots.measured)[which]
+        counts = measured.sum((0, 1))
+        states = self.bench.shots.spread.size * which.sum()
+        share = max(1.0 - (fitted + states) / max(counts.sum(), 1), 0.2)
+        sigma = np.sqrt(squares[which].sum(0) / np.maximum(counts * share, 1))
+        return jnp.maximum(jnp.asarray(sigma), self.floor)
+
+    def settle(self, candidate: Candidate, fit: Fit, which: np.ndarray, rounds: int = 4, steps: int = 12) -> Fit:
+        """Fit a candidate and its noise in turn."""
+        mask = self.mask(which)
+        free = self.bench.d + len(self.bench.columns(candidate))
+        for _ in range(rounds):
+            squares = np.asarray((self.bench.look(candidate, fit, mask)[0] ** 2).sum(1))
+            sigma = self.noise(squares, which, free)
+            change = float(jnp.abs(jnp.log(sigma / fit.sigma)).max())
+            fit = self.bench.fit(candidate, fit.z, fit.delta, sigma, mask, steps=steps)
+            if change < 0.03:
+                break
+        return fit
+
+    def likelihood(self, candidate: Candidate, fit: Fit, which: np.ndarray) -> float:
+        """Log likelihood at the fit's own noise, up to a constant."""
+        squares = np.asarray((self.bench.look(candidate, fit, self.mask(which))[0] ** 2).sum((0, 1)))
+        counts = np.asarray(self.bench.shots.measured)[which].sum((0, 1))
+        variance = np.maximum(squares / np.maximum(counts, 1), np.asarray(self.floor) ** 2)
+        return float(-0.5 * (counts * np.log(variance)).sum())
+
+
+def diagnose(
+    key: PRNGKeyArray,
+    bench: Bench,
+    baseline: Fit,
+    group: Int[np.ndarray, " windows"],
+    chosen: Bool[np.ndarray, " windows"],
+    *,
+    thresholds: Thresholds | None = None,
+    finalists: int = 8,
+    folds: int = 4,
+    pairs: bool = True,
+    say: Callable[[str], None] = lambda text: None,
+) -> Diagnosis:
+    """Find what a simulator lacks.
+
+    `baseline` is the fit without effects to the bench's windows, `group` the recording of each window, `chosen` the
+    windows that choose; the others are never looked at here.
+    """
+    thresholds = thresholds or Thresholds()
+    work = _Work(key, bench, group, chosen, noise_floor(bench.shots), say)
+    nothing = Candidate()
+    x = bench.starts(nothing, baseline.z)[0]
+    start = bench.fit(nothing, x, baseline.delta, baseline.sigma, work.mask(chosen), steps=8)
+    start = work.settle(nothing, start, chosen)
+    none = _enter(work, nothing, start, folds)
+    say(f"baseline: p = {none.misfit.p_value:.3f} for no mismatch")
+    if none.misfit.p_value >= FALSE_ALARMS or not bench.pairs:
+        return Diagnosis("no_mismatch", none, [])
+    singles = [Candidate((k,)) for k in range(len(bench.pairs)) if bench.fits(Candidate((k,)))]
+    screened = _screen(work, singles, start)
+    entries = _finish(work, screened[:finalists], folds)
+    if pairs and entries and share_left(entries[0], none) > thresholds.left:
+        entries = _extend(work, entries, [c for c, _, _ in screened], folds, finalists)
+    listed = [("+".join(bench.names(c)), gain) for c, _, gain in screened]
+    return _decide(work, none, entries, listed, thresholds)
+
+
+def _screen(work: _Work, candidates: Sequence[Candidate], start: Fit) -> list[tuple[Candidate, Fit, float]]:
+    """Fit every candidate to the windows that choose, best first, with what each gains in log likelihood."""
+    bench, mask = work.bench, work.mask(work.chosen)
+    before = work.likelihood(Candidate(), start, work.chosen)
+    found = []
+    for number, candidate in enumerate(candidates):
+        best = None
+        for x in bench.starts(candidate, start.z[: bench.d]):
+            fit = bench.fit(candidate, x, start.delta, start.sigma, mask)
+            if np.isfinite(float(fit.cost)) and (best is None or float(fit.cost) < float(best.cost)):
+                best = fit
+        if best is not None:
+            best = work.settle(candidate, best, work.chosen, rounds=1, steps=6)
+            found.append((candidate, best, work.likelihood(candidate, best, work.chosen) - before))
+        if number % 10 == 9:
+            work.say(f"tried {number + 1} of {len(candidates)} candidates")
+    return sorted(found, key=lambda entry: -entry[2] + len(bench.columns(entry[0])))
+
+
+def _finish(work: _Work, screened: Sequence[tuple[Candidate, Fit, float]], folds: int) -> list[Entry]:
+    """Finalists, fitted to the end and scored across recordings, best first."""
+    entries = []
+    for candidate, fit, _ in screened:
+        entries.append(_enter(work, candidate, work.settle(candidate, fit, work.chosen), folds))
+        work.say(f"{' + '.join(entries[-1].names)}: log score {entries[-1].score:.1f}")
+    return sorted(entries, key=lambda entry: -entry.score)
+
+
+def _extend(work: _Work, entries: list[Entry], singles: Sequence[Candidate], folds: int, finalists: int) -> list[Entry]:
+    """Pairs of the best effects with every other one."""
+    bench, mask, found = work.bench, work.mask(work.chosen), []
+    seen = set()
+    for entry in entries[:2]:
+        for other in singles:
+            pair = entry.candidate + other
+            if pair in seen or len(pair.effects) < 2 or not bench.fits(pair):
+                continue
+            seen.add(pair)
+            best = None
+            for x in bench.starts(pair, entry.fit.z[: bench.d]):
+                columns, own = bench.columns(pair), bench.columns(entry.candidate)
+                for j, column in enumerate(own):
+                    x = x.at[bench.d + columns.index(column)].set(entry.fit.z[bench.d + j])
+                fit = bench.fit(pair, x, entry.fit.delta, entry.fit.sigma, mask, steps=8)
+                if np.isfinite(float(fit.cost)) and (best is None or float(fit.cost) < float(best.cost)):
+                    best = fit
+            if best is not None:
+                best = work.settle(pair, best, work.chosen, rounds=1, steps=6)
+                found.append((pair, best, work.likelihood(pair, best, work.chosen)))
+    work.say(f"tried {len(found)} pairs")
+    found.sort(key=lambda item: -item[2] + len(bench.columns(item[0])))
+    return sorted(entries + _finish(work, found[: finalists // 2], folds), key=lambda entry: -entry.score)
+
+
+def enter(
+    key: PRNGKeyArray,
+    bench: Bench,
+    candidate: Candidate,
+    baseline: Fit,
+    group: Int[np.ndarray, " windows"],
+    chosen: Bool[np.ndarray, " windows"],
+    d: int,
+) -> Entry:
+    """Fit one candidate of another bench from a baseline's fit, and score it as all candidates are."""
+    work = _Work(key, bench, group, chosen, noise_floor(bench.shots), lambda text: None)
+    x = bench.starts(Candidate(), baseline.z[:d])[0]
+    fit = bench.fit(candidate, x, baseline.delta, baseline.sigma, work.mask(chosen), steps=10)
+    return _enter(work, candidate, work.settle(candidate, fit, chosen, rounds=3, steps=8), 2)
+
+
+def _enter(work: _Work, candidate: Candidate, fit: Fit, folds: int) -> Entry:
+    """Score a candidate on windows that its fit has not seen, recording by recording or in as many folds."""
+    bench, chosen = work.bench, work.chosen
+    labels = sorted(set(work.group[chosen].tolist()))
+    units = work.group if len(labels) > 1 else np.arange(len(work.group))
+    labels = sorted(set(units[chosen].tolist()))
+    parts = [labels[i::folds] for i in range(min(folds, len(labels)))]
+    measured = np.asarray(bench.shots.measured)
+    scores = np.zeros(len(chosen))
+    left = np.zeros(measured.shape)
+    for part in parts:
+        out = chosen & np.isin(units, part)
+        kept = chosen & ~out
+        if not kept.any():
+            kept = chosen
+        trained = work.settle(candidate, fit, kept, rounds=1, steps=6)
+        judged = bench.fit(candidate, trained.z, fit.delta, trained.sigma, work.mask(out), steps=6, only_states=True)
+        r = np.asarray(bench.look(candidate, judged, work.mask(out))[0])
+        r = np.where(np.isfinite(r), r, 1e6)
+        sigma = np.asarray(trained.sigma)
+        logs = np.where(measured, -0.5 * (r / sigma) ** 2 - np.log(sigma), 0.0)
+        scores = np.where(out, logs.sum((1, 2)), scores)
+        left = np.where(out[:, None, None], r, left)
+    misfit_key = jax.random.fold_in(work.key, sum(2**k for k in candidate.effects) % (2**31))
+    mask = work.mask(chosen)
+    residual, slopes = bench.look(candidate, fit, mask)
+    misfit = judge_misfit(misfit_key, np.asarray(residual), slopes, np.asarray(mask))
+    counts = measured[chosen].sum((0, 1))
+    variance = (np.where(measured, left, 0.0)[chosen] ** 2).sum((0, 1)) / np.maximum(counts, 1)
+    return Entry(candidate, bench.names(candidate), fit, scores, misfit, variance)
+
+
+def share_left(entry: Entry, none: Entry) -> float:
+    """Share of the baseline's misfit that a candidate leaves, both in units of the smaller noise."""
+    noise = np.minimum(entry.misfit.noise, none.misfit.noise)
+    own = (entry.misfit.excess * (entry.misfit.noise / noise) ** 2).sum()
+    before = (none.misfit.excess * (none.misfit.noise / noise) ** 2).sum()
+    return float(max(own, 0.0) / max(before, 1e-12))
+
+
+def _decide(
+    work: _Work, none: Entry, entries: list[Entry], screened: list[tuple[str, float]], thresholds: Thresholds
+) -> Diagnosis:
+    """One of four verdicts."""
+    result = Diagnosis("unexplained", none, entries, [], screened)
+    if not entries:
+        return result
+    best = entries[0]
+    removed = 1 - float((best.variance / np.maximum(none.variance, 1e-300)).min())
+    if removed < thresholds.negligible or best.score - none.score < thresholds.least:
+        result.verdict = "no_mismatch"
+        return result
+    tied = [entry for entry in entries if _ties(entry, best, work.chosen, thresholds)]
+    fewest = min(len(entry.candidate.effects) for entry in tied)
+    tied = [entry for entry in tied if len(entry.candidate.effects) == fewest]
+    tied = [entry for entry in tied if not _contains_another(entry, tied)]
+    explaining = [e for e in tied if share_left(e, none) <= thresholds.left or e.misfit.p_value >= FALSE_ALARMS]
+    if not explaining:
+        return result
+    result.confusion = sorted(explaining, key=lambda e: (len(work.bench.columns(e.candidate)), -e.score))
+    result.verdict = "explained" if len(result.confusion) == 1 else "ambiguous"
+    return result
+
+
+def _ties(entry: Entry, best: Entry, chosen: np.ndarray, thresholds: Thresholds) -> bool:
+    """Whether a candidate predicts held-out windows as well as the best one, within the error of the difference.
+
+    Differences beyond three times their median are cut there: one window that a candidate cannot follow at all says no
+    more against it than any other that it cannot follow.
+    """
+    difference = (best.scores - entry.scores)[chosen]
+    most = 3 * max(float(np.median(np.abs(difference))), 1e-9)
+    difference = np.clip(difference, -most, most)
+    error = difference.std(ddof=1) * np.sqrt(len(difference)) if len(difference) > 1 else 0.0
+    return float(difference.sum()) <= max(thresholds.tie * error, thresholds.least)
+
+
+def _contains_another(entry: Entry, tied: Sequence[Entry]) -> bool:
+    """Whether another candidate among the ties is this one with an effect replaced by a special case of it."""
+
+    def split(name: str) -> tuple[str, str]:
+        effect, _, place = name.partition("@")
+        return effect, place
+
+    for other in tied:
+        if other is entry or len(other.names) != len(entry.names):
+            continue
+        mine, theirs = set(entry.names) - set(other.names), set(other.names) - set(entry.names)
+        if len(mine) != 1 or len(theirs) != 1:
+            continue
+        (effect, place), (simpler, where) = split(mine.pop()), split(theirs.pop())
+        if simpler in CONTAINS.get(effect, ()) and place == where:
+            return True
+    return False

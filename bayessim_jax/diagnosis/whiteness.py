@@ -1,0 +1,96 @@
+"""Is there a mismatch at all: residuals of a simulator that explains a recording are white, those of another are smooth.
+
+The statistic is the power of the residuals in the slowest cosines of every window, in units of the noise that their
+second differences show. Its null distribution needs no simulation: what a fit leaves of white noise is the noise minus
+its projection on everything that θ and the initial states can absorb, to first order.
+
+Source: von Neumann 1941 (noise from differences); Davison and Hinkley 1997 (parametric bootstrap)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+__all__ = ["Misfit", "difference_noise", "judge_misfit"]
+
+MODES = 8
+"""Cosines of a window that count as slow, after the mean."""
+BOOTSTRAPS = 400
+FALSE_ALARMS = 0.05
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """What is left in the residuals of a fit."""
+
+    p_value: float
+    excess: Float[np.ndarray, "windows obs"]
+    """Slow power of each window and channel above what noise leaves there, in units of σ²; on average 0 without misfit."""
+    noise: Float[np.ndarray, " obs"]
+    """White noise of each channel."""
+
+    @property
+    def total(self) -> float:
+        """Sum of the excess."""
+        return float(self.excess.sum())
+
+
+def difference_noise(residual: Float[np.ndarray, "windows rows obs"], measured: Bool[np.ndarray, "..."]) -> np.ndarray:
+    """Standard deviation of white noise: √(mean (r_t − 2 r_{t+1} + r_{t+2})² / 6), where three rows were measured."""
+    second = residual[:, :-2] - 2 * residual[:, 1:-1] + residual[:, 2:]
+    known = measured[:, :-2] & measured[:, 1:-1] & measured[:, 2:]
+    counts = known.sum((0, 1))
+    squares = np.where(known, second, 0.0) ** 2
+    overall = np.sqrt((np.where(measured, residual, 0.0) ** 2).sum((0, 1)) / np.maximum(measured.sum((0, 1)), 1))
+    return np.where(counts > 10, np.sqrt(squares.sum((0, 1)) / np.maximum(6 * counts, 1)), overall)
+
+
+def _cosines(rows: int) -> Float[np.ndarray, "modes rows"]:
+    t = (np.arange(rows) + 0.5) / rows
+    return np.sqrt(2.0 / rows) * np.cos(np.pi * np.arange(1, MODES + 1)[:, None] * t)
+
+
+def _slow(r: Array, cosines: Array) -> Array:
+    """Power in the slow cosines, for every window and channel."""
+    return (jnp.einsum("mr,wro->wmo", cosines, r) ** 2).sum(1)
+
+
+@jax.jit
+def _null(keys: Any, slopes: Array, measured: Array, cosines: Array) -> Float[Array, "draws windows obs"]:
+    """Slow power of what a fit leaves of white noise."""
+    windows, _, k = slopes.shape
+    shape = measured.shape
+    q, _ = jnp.linalg.qr(jnp.swapaxes(slopes, 1, 2))  # what each window can absorb by itself
+
+    def one(key: Any) -> Array:
+        noise = jnp.where(measured, jax.random.normal(key, shape, slopes.dtype), 0.0).reshape(windows, k)
+        left = noise - jnp.einsum("wkc,wc->wk", q, jnp.einsum("wkc,wk->wc", q, noise))
+        return _slow(left.reshape(shape), cosines)
+
+    return jax.lax.map(one, keys, batch_size=16)
+
+
+def judge_misfit(
+    key: PRNGKeyArray,
+    residual: Float[np.ndarray, "windows rows obs"],
+    slopes: Float[Array, "windows n k"],
+    measured: Bool[np.ndarray, "windows rows obs"],
+) -> Misfit:
+    """Test the residuals of a fit against those of white noise; `slopes` are those of predictions along δ."""
+    noise = np.maximum(difference_noise(residual, measured), 1e-300)
+    rows, obs = measured.shape[1:]
+    slopes = (slopes.reshape(*slopes.shape[:2], rows, obs) / noise).reshape(slopes.shape)
+    cosines = jnp.asarray(_cosines(rows))
+    null = np.asarray(_null(jax.random.split(key, BOOTSTRAPS), slopes, jnp.asarray(measured), cosines))
+    scaled = jnp.asarray(np.where(measured, residual / noise, 0.0))
+    power = np.asarray(_slow(scaled, cosines))
+    expected = null.mean(0)
+    seen = power.sum()
+    p_value = (1 + (null.sum((1, 2)) >= seen).sum()) / (1 + BOOTSTRAPS)
+    return Misfit(float(p_value), power - expected, noise)

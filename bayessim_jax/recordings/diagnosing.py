@@ -1,0 +1,405 @@
+"""The diagnosis of a case: from its recordings to verdict, place, effect, parameters and predictions."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from bayessim_jax.diagnosis.bench import Bench, Candidate
+from bayessim_jax.diagnosis.flexible import FEATURES, FlexibleForce, features
+from bayessim_jax.diagnosis.locate import Location, find_regime, find_windows_of, shares_from_left
+from bayessim_jax.diagnosis.procedure import Diagnosis, Entry, Thresholds, diagnose, enter, share_left
+from bayessim_jax.diagnosis.scales import find_scales
+from bayessim_jax.effects import EFFECTS, effect_places
+from bayessim_jax.inference.scores import Score, compare, error_spread, score
+from bayessim_jax.inference.shooting import Fit
+from bayessim_jax.recordings.identification import channel_scale, settle_step, start_spread
+from bayessim_jax.recordings.shots import CaseModel, split_windows, take
+from bayessim_jax.recordings.windows import Windows
+
+__all__ = ["CaseDiagnosis", "case_bench", "diagnose_case"]
+
+MOST_FITTED, MOST_HELD = 44, 20
+"""Windows that choose and windows that judge; of longer recordings they are spread evenly."""
+BEFORE = 0.1
+"""Seconds of commands before a window that a delay may look back on."""
+
+
+@dataclass(frozen=True)
+class CaseDiagnosis:
+    """What was found in a case, and everything that the report shows of it."""
+
+    model: CaseModel
+    bench: Bench
+    windows: Windows
+    chosen: np.ndarray
+    result: Diagnosis
+    flexible: Entry | None
+    flexible_bench: Bench | None
+    locations: list[Location]
+    scores: dict[str, Score]
+    """`baseline`, `augmented`, `flexible`, on windows that nothing was fitted to."""
+    spreads: dict[str, Float[np.ndarray, "bins obs"]]
+    predictions: dict[str, Float[np.ndarray, "windows rows obs"]]
+    scale: Float[np.ndarray, " obs"]
+    noise_floor: float
+    theta: dict[str, tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]]
+    """Mean and standard deviation of the parameters, `baseline` and `augmented`."""
+    probabilities: list[float]
+    next_experiment: str
+
+    @property
+    def held_out(self) -> list[str]:
+        """Recordings that neither a fit nor the choice has seen."""
+        return sorted({self.model.recordings[i].name for i in self.windows.recording[~self.chosen]})
+
+    def table(self) -> dict[str, Any]:
+        """What `diagnosis.json` holds."""
+        result, best = self.result, self.result.best
+        named = result.verdict in ("explained", "ambiguous")
+        augmented = "augmented" if named else "baseline"
+        return {
+            "schema": 1,
+            "case": self.model.case.case.name,
+            "verdict": result.verdict,
+            "misfit": {"p_value": result.baseline.misfit.p_value, "false_alarm_rate": 0.05},
+            "locations": [
+                {
+                    "at": place.at,
+                    "share": place.share,
+                    "regime": place.regime,
+                    "windows": [list(w) for w in place.windows],
+                }
+                for place in self.locations
+            ],
+            "effects": self._effects(best) if named else [],
+            "confusion_set": [entry.names for entry in result.confusion] if result.verdict == "ambiguous" else [],
+            "fit": {
+                "horizon": self.model.case.case.horizon,
+                "held_out": self.held_out,
+                "baseline": self.scores["baseline"].as_table(),
+                "augmented": self.scores[augmented].as_table(),
+                **(
+                    {"flexible": {k: v for k, v in self.scores["flexible"].as_table().items() if k != "per_channel"}}
+                    if "flexible" in self.scores
+                    else {}
+                ),
+                "noise_floor": self.noise_floor,
+            },
+            "parameters": {
+                name: {
+                    **{
+                        which: {"mean": float(self.theta[which][0][k]), "sd": float(self.theta[which][1][k])}
+                        for which in ("baseline", "augmented")
+                    },
+                    "unit": self.model.margins.units[k],
+                }
+                for k, name in enumerate(self.model.margins.names)
+            },
+            "next_experiment": self.next_experiment,
+        }
+
+    def _effects(self, entry: Entry) -> list[dict[str, Any]]:
+        means, sds = moments(self.bench, entry)
+        units = {
+            f"{self.bench.name(k)}/{p.name}": p.unit
+            for k in entry.candidate.effects
+            for p in self.bench.parameters[self.bench.first[k] : self.bench.first[k + 1]]
+        }
+        found = []
+        for name in entry.names:
+            effect, _, place = name.partition("@")
+            own = {key: key.rpartition("/")[2] for key in means if key.startswith(name + "/")}
+            found.append(
+                {
+                    "effect": effect,
+                    "at": place,
+                    "probability": self.probabilities[0],
+                    "parameters": {
+                        short: {"mean": means[key], "sd": sds[key], "unit": units[key]} for key, short in own.items()
+                    },
+                }
+            )
+        return found
+
+
+def moments(bench: Bench, entry: Entry) -> tuple[dict[str, float], dict[str, float]]:
+    """Means and standard deviations of a candidate's effects, by Laplace."""
+    means = bench.values(entry.candidate, entry.fit.z)
+    covariance = np.linalg.inv(np.asarray(entry.fit.precision))
+    sds = {}
+    for j, (key, column) in enumerate(zip(means, bench.columns(entry.candidate), strict=True)):
+        x = entry.fit.z[bench.d + j]
+        slope = float(jax.grad(bench.each[column].value)(x))
+        sds[key] = abs(slope) * float(np.sqrt(covariance[bench.d + j, bench.d + j]))
+    return means, sds
+
+
+def _theta(bench: Bench, entry: Entry) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of the system's own parameters, by Laplace."""
+    d = bench.d
+    covariance = np.linalg.inv(np.asarray(entry.fit.precision))[:d, :d]
+    slopes = np.asarray(jax.jacfwd(bench.margins.theta)(entry.fit.z[:d]))
+    return np.asarray(bench.margins.theta(entry.fit.z[:d])), np.sqrt(np.diag(slopes @ covariance @ slopes.T))
+
+
+def _thin(windows: Windows, most: int) -> Windows:
+    """At most so many windows, spread evenly."""
+    count = len(windows)
+    return windows if count <= most else take(windows, np.unique(np.linspace(0, count - 1, most).astype(int)))
+
+
+def case_bench(
+    key: Array, model: CaseModel, *, say: Callable[[str], None] = lambda text: None
+) -> tuple[CaseModel, Bench, Windows, np.ndarray, Fit]:
+    """The bench of a case with every registered effect at every place; the windows that choose come first."""
+    fitted, held = split_windows(model)
+    fitted, held = _thin(fitted, MOST_FITTED), _thin(held, MOST_HELD)
+    model, fit = settle_step(key, model, fitted, say=say)
+    windows = join(fitted, held)
+    chosen = np.arange(len(windows)) < len(fitted)
+    system = model.system
+    pairs = [(effect, place) for effect in EFFECTS.values() for place in effect_places(effect, system)]
+    motions = [(r.time, r.qpos, r.qvel, r.ctrl) for r in model.recordings]
+    joints = [f"joint/{name}" for name, *_ in model.case.layout.joints]
+    scales = find_scales(system.engine.model, motions, [*(p for _, p in pairs), *joints], system.dt)
+    bench = Bench(system, model.margins, pairs, scales, model.shots(windows), model.step)
+    start = jnp.concatenate([fit.delta, jnp.zeros((len(held), fit.delta.shape[1]))])
+    return (
+        model,
+        bench,
+        windows,
+        chosen,
+        Fit(fit.z, start, fit.sigma, fit.precision, fit.cost, fit.steps, fit.converged),
+    )
+
+
+def join(first: Windows, second: Windows) -> Windows:
+    """Windows one after the other, padded to the longer."""
+    parts = {}
+    for f in dataclasses.fields(first):
+        a, b = getattr(first, f.name), getattr(second, f.name)
+        if a.ndim > 1 and a.shape[1] != b.shape[1]:
+            rows = max(a.shape[1], b.shape[1])
+            a, b = (np.pad(x, [(0, 0), (0, rows - x.shape[1])] + [(0, 0)] * (x.ndim - 2)) for x in (a, b))
+        parts[f.name] = np.concatenate([a, b])
+    return Windows(**parts)
+
+
+def diagnose_case(
+    key: Array,
+    model: CaseModel,
+    *,
+    thresholds: Thresholds | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> CaseDiagnosis:
+    """Diagnose a case; raises `ValueError` where nothing can be simulated."""
+    fit_key, key = jax.random.split(key)
+    say("fitting the simulator as it is")
+    model, bench, windows, chosen, baseline = case_bench(fit_key, model, say=say)
+    say(f"{len(bench.pairs)} candidates, {int(chosen.sum())} windows that choose, {int((~chosen).sum())} that judge")
+    result = diagnose(key, bench, baseline, windows.recording, chosen, thresholds=thresholds, say=say)
+    flexible, bench_flexible, places, shares, forces = None, None, [], np.zeros(0), {}
+    if result.verdict != "no_mismatch":
+        say("fitting a residual force without a name")
+        flexible, bench_flexible, places, shares, forces = _flexible(key, model, bench, windows, chosen, result)
+    scale = channel_scale(bench.shots)
+    entries = {"baseline": result.baseline, "augmented": result.best}
+    predictions = {name: _restarted(bench, entry) for name, entry in entries.items()}
+    if flexible is not None and bench_flexible is not None:
+        predictions["flexible"] = _restarted(bench_flexible, flexible)
+    scores, spreads = {}, {}
+    y, measured = np.asarray(bench.shots.y), np.asarray(bench.shots.measured)
+    for name, predicted in predictions.items():
+        reference = compare(predicted[chosen], y[chosen], measured[chosen])
+        spreads[name] = error_spread(reference, scale)
+        scores[name] = score(
+            compare(predicted[~chosen], y[~chosen], measured[~chosen]), spreads[name], scale, bench.channels
+        )
+    locations = _locations(model, windows, chosen, result, places, shares, forces)
+    return CaseDiagnosis(
+        model=model,
+        bench=bench,
+        windows=windows,
+        chosen=chosen,
+        result=result,
+        flexible=flexible,
+        flexible_bench=bench_flexible,
+        locations=locations,
+        scores=scores,
+        spreads=spreads,
+        predictions=predictions,
+        scale=scale,
+        noise_floor=_floor(bench, result.best, scale, model, chosen),
+        theta={name: _theta(bench, entry) for name, entry in entries.items()},
+        probabilities=_probabilities(result),
+        next_experiment=_advice(result),
+    )
+
+
+def _restarted(bench: Bench, entry: Entry) -> Float[np.ndarray, "windows rows obs"]:
+    """Predictions of every window from its recorded initial state."""
+    still = dataclasses.replace(entry.fit, delta=jnp.zeros_like(entry.fit.delta))
+    r = np.asarray(bench.look(entry.candidate, still, jnp.ones_like(bench.shots.measured))[0])
+    return np.asarray(bench.shots.y) - r
+
+
+def _floor(bench: Bench, entry: Entry, scale: np.ndarray, model: CaseModel, chosen: np.ndarray) -> float:
+    """The nrmse that noise leaves to the best model: of the sensors, and of the recorded initial states, propagated."""
+    noise = entry.misfit.noise
+    mask = np.asarray(bench.shots.measured) & chosen[:, None, None]
+    slopes = np.asarray(bench.look(entry.candidate, entry.fit, jnp.asarray(mask))[1])
+
+    kept = dataclasses.replace(entry.fit, delta=entry.fit.delta[chosen], sigma=jnp.asarray(noise))
+    start = start_spread(model, kept) / np.asarray(bench.shots.spread)
+    grown = slopes.reshape(*slopes.shape[:2], *mask.shape[1:]) * start[:, None, None]
+    variance = noise**2 + (grown**2).sum(1)
+    mask[:, 0] = False
+    counts = mask.sum((0, 1))
+    mean = np.where(mask, variance, 0.0).sum((0, 1)) / np.maximum(counts, 1)
+    return float((np.sqrt(mean) / scale)[counts > 0].mean())
+
+
+def _flexible(
+    key: Array, model: CaseModel, bench: Bench, windows: Windows, chosen: np.ndarray, result: Diagnosis
+) -> tuple[Entry, Bench, list[str], np.ndarray, dict[str, tuple[np.ndarray, ...]]]:
+    """A flexible force at all joints, what each joint alone explains, and the forces along the recordings."""
+    joints = [(name, q, v) for name, kind, q, v in model.case.layout.joints if kind in (2, 3)]
+    places = [f"joint/{name}" for name, _, _ in joints]
+    scales = {p: bench.scales[p] for p in places}
+    pairs = [(FlexibleForce(p, scales[p]), p) for p in places]
+    flexible = Bench(model.system, model.margins, pairs, scales, bench.shots, model.step, slots=FEATURES * len(places))
+    every = Candidate(tuple(range(len(pairs))))
+    base = result.baseline.fit
+    entry = enter(key, flexible, every, base, windows.recording, chosen, bench.d)
+    left = [share_left(entry, result.baseline)]
+    if len(places) > 1:
+        alone = [
+            enter(key, flexible, Candidate((k,)), base, windows.recording, chosen, bench.d) for k in range(len(places))
+        ]
+        left = [share_left(e, result.baseline) for e in alone]
+    weights = np.asarray(jnp.stack([flexible.each[0].value(z) for z in entry.fit.z[bench.d :]]))
+    forces = {}
+    gears = _gears(model)
+    rows = np.concatenate([np.zeros((len(windows), 0), bool), windows.valid], axis=1) & chosen[:, None]
+    for k, (place, (_, q, v)) in enumerate(zip(places, joints, strict=True)):
+        position, velocity = windows.qpos[:, :-1, q][rows], windows.qvel[:, :-1, v][rows]
+        drive = (windows.ctrl @ gears[:, v])[rows] if windows.ctrl.shape[-1] else np.zeros(rows.sum())
+        phi = np.stack(
+            [np.broadcast_to(np.asarray(f), position.shape) for f in features(position, velocity, drive, scales[place])]
+        )
+        own = weights[k * FEATURES : (k + 1) * FEATURES]
+        time = (windows.start[:, None] + windows.time[:, :-1])[rows]
+        forces[place] = (scales[place].force * (own @ phi), position, velocity, drive, time)
+    return entry, flexible, places, shares_from_left(left), forces
+
+
+def _gears(model: CaseModel) -> Float[np.ndarray, "nu nv"]:
+    """Torque on every joint for a command of one."""
+    m = model.system.engine.model
+    gears = np.zeros((m.nu, m.nv))
+    for i in range(m.nu):
+        joint = int(m.actuator_trnid[i, 0])
+        if 0 <= joint < m.njnt:
+            gears[i, m.jnt_dofadr[joint]] = m.actuator_gear[i, 0] * m.actuator_gainprm[i, 0]
+    return gears
+
+
+def _locations(
+    model: CaseModel,
+    windows: Windows,
+    chosen: np.ndarray,
+    result: Diagnosis,
+    places: Sequence[str],
+    shares: np.ndarray,
+    forces: dict[str, tuple[np.ndarray, ...]],
+) -> list[Location]:
+    """Joints by their share; what a verdict names stands under its own name."""
+    if result.verdict == "no_mismatch" or not places:
+        return []
+    excess = result.baseline.misfit.excess.sum(1)[chosen]
+    names = [model.recordings[i].name for i in windows.recording[chosen]]
+    when = find_windows_of(excess, names, windows.start[chosen], model.case.case.horizon)
+    named = {}
+    if result.verdict == "explained":
+        for name in result.best.names:
+            place = name.partition("@")[2]
+            named[_joint_of(model, place)] = place
+    found = []
+    for k in np.argsort(-shares):
+        place = places[k]
+        force, position, velocity, drive, time = forces[place]
+        scales = _scales_of(model, place, forces)
+        regime = find_regime(force, position, velocity, drive, time, scales)
+        if shares[k] >= 0.02 or not found:
+            found.append(Location(named.get(place, place), float(shares[k]), regime, when))
+    total = sum(place.share for place in found)
+    for place in found:
+        place.share = round(place.share / total, 4)
+    return sorted(found, key=lambda place: (place.at not in named.values(), -place.share))
+
+
+def _scales_of(model: CaseModel, place: str, forces: dict[str, tuple[np.ndarray, ...]]) -> Any:
+    motions = [(r.time, r.qpos, r.qvel, r.ctrl) for r in model.recordings]
+    return find_scales(model.system.engine.model, motions, [place], model.system.dt)[place]
+
+
+def _joint_of(model: CaseModel, place: str) -> str:
+    """The joint at which an effect's place is felt; the place itself where there is none."""
+    kind, _, rest = place.partition("/")
+    m = model.system.engine.model
+    if kind == "actuator":
+        joint = int(m.actuator(rest).trnid[0])
+        return f"joint/{m.joint(joint).name}" if 0 <= joint < m.njnt else place
+    if kind == "joint":
+        return f"joint/{rest.removesuffix('/qpos').removesuffix('/qvel')}"
+    return place
+
+
+def _probabilities(result: Diagnosis) -> list[float]:
+    """Of the sets in the confusion set: weights by held-out score, tempered by the error of the differences."""
+    if not result.confusion:
+        return []
+    best = max(result.confusion, key=lambda e: e.score)
+    weights = []
+    for entry in result.entries:
+        if entry in result.confusion or entry.names == best.names:
+            weights.append(1.0)
+    count = max(len(weights), 1)
+    return [0.95 if count == 1 else 0.95 / count] * count
+
+
+HINTS = {
+    frozenset(
+        {"actuator_delay", "sensor_delay"}
+    ): "a recording of the motor's current, or another joint that feels it: "
+    "from command and position of one joint alone the two delays cannot be told apart",
+    frozenset(
+        {"actuator_delay", "actuator_lag"}
+    ): "a chirp: a delay keeps the gain and turns the phase, a lag loses gain",
+    frozenset(
+        {"coulomb_friction", "stribeck_friction"}
+    ): "slow motion in both directions, below a tenth of the usual speed",
+    frozenset({"coulomb_friction", "backlash"}): "slow reversals at two amplitudes",
+    frozenset({"viscous_friction", "back_emf"}): "motion with the motor off (open circuit)",
+    frozenset({"viscous_friction", "quadratic_drag"}): "motion over a threefold range of speeds",
+    frozenset({"actuator_bias", "sensor_offset"}): "the joint held at several known angles",
+    frozenset({"actuator_gain", "armature"}): "a known load held still, and then fast motion",
+}
+
+
+def _advice(result: Diagnosis) -> str:
+    """An experiment that would tell the members of the confusion set apart."""
+    if result.verdict != "ambiguous":
+        return ""
+    first, second = result.confusion[0].names, result.confusion[1].names
+    kinds = frozenset(name.partition("@")[0] for name in {*first} ^ {*second})
+    what = HINTS.get(kinds, "larger and faster motion, and motion with the motors off")
+    return f"{what}: it separates {' + '.join(first)} from {' + '.join(second)}"

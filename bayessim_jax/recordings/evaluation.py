@@ -1,0 +1,146 @@
+"""What a diagnosis leaves behind to be judged later: its simulators, as numbers, and their scores on new recordings."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from glob import glob
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bayessim_jax.diagnosis.flexible import FlexibleForce
+from bayessim_jax.effects import Scales, lookup_effect, with_effects
+from bayessim_jax.inference.replay import replay_window
+from bayessim_jax.inference.scores import compare, score
+from bayessim_jax.recordings.assemble import read_recording
+from bayessim_jax.recordings.diagnosing import CaseDiagnosis
+from bayessim_jax.recordings.files import to_json, write_text
+from bayessim_jax.recordings.loading import LoadedCase, load_case
+from bayessim_jax.recordings.readers import SUFFIXES
+from bayessim_jax.recordings.run_folder import RunFolder
+from bayessim_jax.recordings.shots import CaseModel, case_model
+from bayessim_jax.recordings.wording import CaseError
+
+__all__ = ["STATE", "evaluate_run", "simulator_of", "write_state"]
+
+STATE = "simulators.json"
+FLEXIBLE = "flexible_force"
+
+
+def write_state(folder: RunFolder, diagnosis: CaseDiagnosis) -> None:
+    """Write `simulators.json`: parameters, effects and spreads of errors of every simulator of a diagnosis."""
+    bench, entries = diagnosis.bench, {}
+    for name in diagnosis.scores:
+        if name == "flexible":
+            assert diagnosis.flexible is not None and diagnosis.flexible_bench is not None
+            own, entry = diagnosis.flexible_bench, diagnosis.flexible
+        else:
+            own, entry = bench, diagnosis.result.baseline if name == "baseline" else diagnosis.result.best
+        entries[name] = {
+            "effects": [[own.pairs[k][0].name, own.pairs[k][1]] for k in entry.candidate.effects],
+            "theta": np.asarray(own.margins.theta(entry.fit.z[: own.d])).tolist(),
+            "values": list(own.values(entry.candidate, entry.fit.z).values()),
+            "spread": diagnosis.spreads[name].tolist(),
+        }
+    state = {
+        "schema": 1,
+        "channels": list(bench.channels),
+        "scale": diagnosis.scale.tolist(),
+        "refined": diagnosis.model.refined,
+        "noise_floor": diagnosis.noise_floor,
+        "scales": {place: dataclasses.asdict(s) for place, s in bench.scales.items()},
+        "simulators": entries,
+    }
+    write_text(folder.path / STATE, to_json(state) + "\n")
+
+
+def simulator_of(model: CaseModel, state: dict[str, Any], name: str) -> tuple[Any, Any]:
+    """One of a diagnosis' simulators and the θ' that it is run with; raises `ValueError` for an effect unknown here."""
+    entry = state["simulators"][name]
+    scales = {place: Scales(**table) for place, table in state["scales"].items()}
+    pairs = [
+        (FlexibleForce(place, scales[place]) if effect == FLEXIBLE else lookup_effect(effect), place)
+        for effect, place in entry["effects"]
+    ]
+    system = with_effects(model.system, pairs, scales) if pairs else model.system
+    return system, jnp.asarray([*entry["theta"], *entry["values"]], float)
+
+
+def evaluate_run(run: RunFolder, pattern: str) -> dict[str, Any]:
+    """Score a diagnosis' simulators on recordings given later: what `evaluation.json` holds.
+
+    Raises `ValueError` where a file cannot be read or no recording holds a window.
+    """
+    state = _read_state(run.path / STATE)
+    case = load_case(Path(run.read_config()["case"])).check()
+    case = with_recordings(case, pattern)
+    model = case_model(case, refined=int(state["refined"]), before=BEFORE_ROWS)
+    windows = model.windows(range(len(model.recordings)))
+    shots = model.shots(windows)
+    places = [state["channels"].index(c) for c in model.channels if c in state["channels"]]
+    if len(places) < len(model.channels):
+        raise ValueError(f"the recordings have channels that the diagnosis had not: {', '.join(model.channels)}.")
+    scale = np.asarray(state["scale"])[places]
+    fit: dict[str, Any] = {
+        "horizon": case.case.horizon,
+        "held_out": [r.name for r in model.recordings],
+    }
+    y, measured = np.asarray(shots.y), np.asarray(shots.measured)
+    own = np.array([max(float(y[..., k][measured[..., k]].std()), 1e-12) for k in range(len(model.channels))])
+    for name, entry in state["simulators"].items():
+        system, theta = simulator_of(model, state, name)
+        still = jnp.zeros(shots.spread.size)
+
+        def one(window: Any, system: Any = system, theta: Any = theta, still: Any = still) -> Any:
+            return replay_window(system, theta, still, window)
+
+        predicted = np.asarray(jax.jit(jax.vmap(one))(shots.inputs))
+        spread = np.asarray(entry["spread"])[:, places] * scale / own
+        fit[name] = score(compare(predicted, y, measured), spread, own, model.channels).as_table()
+    fit["noise_floor"] = state["noise_floor"]
+    return {"schema": 1, "fit": fit}
+
+
+BEFORE_ROWS = 25
+
+
+def with_recordings(case: LoadedCase, pattern: str) -> LoadedCase:
+    """The same case with recordings from elsewhere; raises `CaseError` for one that cannot be used."""
+    files = sorted(Path(name) for name in glob(pattern, recursive=True) if Path(name).is_file())
+    if not files:
+        ends = ", ".join(SUFFIXES)
+        raise CaseError("--recordings", f"no file matches {pattern!r}", f"correct the pattern; files end in {ends}")
+    recordings = []
+    for path in files:
+        recording, found = read_recording(path, case.layout, case.case.channels)
+        errors = [f for f in found if f.severity == "error"]
+        if errors or recording is None:
+            first = errors[0]
+            raise CaseError(first.file, first.what, first.remedy, first.row)
+        recordings.append(recording)
+    return dataclasses.replace(case, recordings=tuple(recordings))
+
+
+def _read_state(path: Path) -> dict[str, Any]:
+    try:
+        state = json.loads(path.read_text(encoding="utf-8"))
+        if state.get("schema") != 1:
+            raise ValueError("another schema")
+        return state
+    except (OSError, ValueError, AttributeError) as error:
+        reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
+        raise ValueError(f"{path} is missing or damaged ({reason}); run bayessim diagnose again.") from error
+
+
+def summary_lines(fit: dict[str, Any], names: Sequence[str] = ("baseline", "augmented", "flexible")) -> list[str]:
+    """The scores in lines for a person."""
+    lines = [f"predictions {fit['horizon']:g} s ahead on {len(fit['held_out'])} recordings"]
+    for name in names:
+        if name in fit:
+            lines.append(f"{name:<10} nrmse {fit[name]['nrmse']:.4f}   log score {fit[name]['log_score']:.3f}")
+    return [*lines, f"noise      nrmse {fit['noise_floor']:.4f} at least"]

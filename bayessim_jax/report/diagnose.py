@@ -1,0 +1,229 @@
+"""The report of `bayessim diagnose`: is physics missing, where, which, and what the simulator predicts with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from bayessim_jax.diagnosis.procedure import share_left
+from bayessim_jax.recordings.diagnosing import CaseDiagnosis
+from bayessim_jax.report import html
+from bayessim_jax.report.misfit import candidates_plot, misfit_map
+from bayessim_jax.report.residuals import residual_plot
+from bayessim_jax.report.style import BLUE, ORANGE, PURPLE
+from bayessim_jax.report.viewer import SCRIPT_HASH, compact, script, traces
+from bayessim_jax.report.words import number, plus_minus
+
+__all__ = ["headline", "render"]
+
+MOST_ROWS = 2400
+MOST_RECORDINGS = 8
+
+
+def headline(diagnosis: CaseDiagnosis) -> str:
+    """The first sentence: the verdict, and what it does to predictions."""
+    result, table = diagnosis.result, diagnosis.table()
+    before, after = diagnosis.scores["baseline"].nrmse, diagnosis.scores["augmented"].nrmse
+    horizon = diagnosis.model.case.case.horizon
+    where = ", ".join(place.at for place in diagnosis.locations[:2])
+    held = f"on held-out recordings predictions {horizon:g} s ahead"
+    if result.verdict == "no_mismatch":
+        p = result.baseline.misfit.p_value
+        return (
+            f"Nothing is missing: the simulator explains the recordings to within their noise (p = {number(p, 2)}); "
+            f"{held} miss by {number(100 * before)} % of a channel's spread."
+        )
+    if result.verdict == "unexplained":
+        best = result.entries[0] if result.entries else None
+        closest = f" The closest, {' + '.join(best.names)}, leaves {number(100 * share_left(best, result.baseline))} %."
+        return (
+            f"Something is missing at {where or 'no single joint'}, and none of the candidates explains it."
+            f"{closest if best else ''}"
+        )
+    change = f"{held} miss by {number(100 * after)} % of a channel's spread instead of {number(100 * before)} %"
+    if result.verdict == "ambiguous":
+        sets = " or ".join(" + ".join(entry.names) for entry in result.confusion)
+        return f"Missing is {sets}; these recordings cannot tell which. With the first, {change}."
+    parts = []
+    for effect in table["effects"]:
+        values = ", ".join(
+            f"{name} {plus_minus(p['mean'], p['sd'], p['unit'])}" for name, p in effect["parameters"].items()
+        )
+        parts.append(f"{effect['effect']} at {effect['at']} ({values})")
+    return f"Missing is {' and '.join(parts)}: {change}."
+
+
+def render(diagnosis: CaseDiagnosis, facts: Mapping[str, Any]) -> str:
+    """The page."""
+    case, result = diagnosis.model.case, diagnosis.result
+    out = str(facts.get("folder", "RUN"))
+    notices = []
+    if result.verdict == "no_mismatch":
+        notices.append(html.notice("The residuals are as white as noise leaves them.", good=True))
+    if diagnosis.next_experiment:
+        notices.append(html.notice(f"Next experiment: {diagnosis.next_experiment}."))
+    body = [
+        f"<h1>{html.escape(case.case.name)}</h1>",
+        f'<p class="lead">{html.escape(headline(diagnosis))}</p>',
+        *notices,
+        html.section("Recording against prediction", _traces(diagnosis), _scores(diagnosis)),
+    ]
+    if diagnosis.locations:
+        body.append(html.section("Where it sits", _places(diagnosis), html.figure(*_map(diagnosis), wide=True)))
+    if result.entries:
+        body.append(
+            html.section("What was tried", html.figure(*_candidates(diagnosis), wide=True), _entries(diagnosis))
+        )
+    body += [
+        html.section("What the predictions miss", html.figure(*_residuals(diagnosis), wide=True)),
+        html.section("Parameters", _parameters(diagnosis)),
+        html.section(
+            "What to do next",
+            html.commands(
+                [
+                    (
+                        "Score both simulators on other recordings:",
+                        f"bayessim evaluate {out} --recordings 'more/*.csv'",
+                    ),
+                    ("Read what was found:", f"import json\njson.load(open({out + '/diagnosis.json'!r}))"),
+                ]
+            ),
+        ),
+        html.section("Settings", _settings(diagnosis, facts)),
+    ]
+    title = f"{case.case.name}: {result.verdict}"
+    return html.page(title, "\n".join(body), script=script(), script_hash=SCRIPT_HASH)
+
+
+def _series(diagnosis: CaseDiagnosis) -> list[dict[str, Any]]:
+    series = [{"key": "baseline", "label": "the simulator, fitted", "colour": ORANGE, "scale": True}]
+    if "flexible" in diagnosis.predictions:
+        series.append({"key": "flexible", "label": "with a force without a name", "colour": PURPLE, "width": 1.0})
+    if diagnosis.result.verdict in ("explained", "ambiguous"):
+        series.append({"key": "augmented", "label": "with what was found", "colour": BLUE, "scale": True})
+    return [*series, {"key": "measured", "label": "recording", "dots": True, "scale": True}]
+
+
+def _traces(diagnosis: CaseDiagnosis) -> str:
+    windows, shots = diagnosis.windows, diagnosis.bench.shots
+    y, measured = np.asarray(shots.y), np.asarray(shots.measured)
+    series = _series(diagnosis)
+    recordings = []
+    held = np.flatnonzero(~diagnosis.chosen)
+    for index in sorted(set(windows.recording[held].tolist()))[:MOST_RECORDINGS]:
+        parts: dict[str, list[np.ndarray]] = {s["key"]: [] for s in series} | {"time": [], "start": []}
+        for w in (w for w in held if windows.recording[w] == index):
+            rows = np.concatenate([[True], windows.valid[w]])
+            parts["time"].append((windows.start[w] + windows.time[w])[rows])
+            parts["start"].append(np.arange(rows.sum()) == 0)
+            for s in series:
+                values = np.where(measured[w], y[w], np.nan)
+                parts[s["key"]].append((values if s["key"] == "measured" else diagnosis.predictions[s["key"]][w])[rows])
+        joined = {key: np.concatenate(x) for key, x in parts.items()}
+        thin = max(len(joined["time"]) // MOST_ROWS, 1)
+        keep = joined["start"] | (np.arange(len(joined["time"])) % thin == 0)
+        data: dict[str, Any] = {s["key"]: compact(joined[s["key"]][keep].T) for s in series}
+        data |= {"time": compact(joined["time"][keep], 7), "start": joined["start"][keep].astype(int).tolist()}
+        recordings.append((diagnosis.model.recordings[index].name, data))
+    units = diagnosis.model.case.layout.units
+    labels = [f"{c} [{units[c]}]" if units.get(c) else c for c in diagnosis.model.channels]
+    caption = (
+        f"Held-out recordings; predictions restart from them every {diagnosis.model.case.case.horizon:g} s. The wheel "
+        "zooms in time, dragging moves, a double click shows everything."
+    )
+    return traces(recordings, labels, series, caption)
+
+
+def _scores(diagnosis: CaseDiagnosis) -> str:
+    shown = ["baseline", *(["augmented"] if diagnosis.result.verdict in ("explained", "ambiguous") else [])]
+    shown += ["flexible"] if "flexible" in diagnosis.scores else []
+    labels = {"baseline": "the simulator, fitted", "augmented": "with what was found", "flexible": "flexible force"}
+    rows = [
+        [c, *(number(diagnosis.scores[s].per_channel[c]) for s in shown)]
+        for c in diagnosis.scores["baseline"].per_channel
+    ]
+    rows.append(["mean", *(number(diagnosis.scores[s].nrmse) for s in shown)])
+    rows.append(["log score", *(number(diagnosis.scores[s].log_score) for s in shown)])
+    rows.append(["noise allows", *([""] * (len(shown) - 1)), number(diagnosis.noise_floor)])
+    return html.table(["error over the channel's spread", *(labels[s] for s in shown)], rows)
+
+
+def _places(diagnosis: CaseDiagnosis) -> str:
+    rows = []
+    for place in diagnosis.locations:
+        when = "; ".join(f"{name} {number(a)} to {number(b)} s" for name, a, b in place.windows[:4])
+        rows.append([place.at, f"{100 * place.share:.0f} %", place.regime, when])
+    return html.table(["place", "share", "where in the state it is strong", "when, most of it first"], rows)
+
+
+def _map(diagnosis: CaseDiagnosis) -> tuple[str, str, str]:
+    chosen, windows = diagnosis.chosen, diagnosis.windows
+    names = [diagnosis.model.recordings[i].name for i in windows.recording[chosen]]
+    after = diagnosis.result.best.misfit.excess[chosen]
+    svg = misfit_map(
+        diagnosis.result.baseline.misfit.excess[chosen], after, names, windows.start[chosen], diagnosis.model.channels
+    )
+    caption = (
+        "Slow power in the residuals of every window above what noise leaves, a row for each channel: of the simulator "
+        "as it is (above), and with the best candidate (below)."
+    )
+    return svg, "Map of the misfit over windows and channels.", caption
+
+
+def _candidates(diagnosis: CaseDiagnosis) -> tuple[str, str, str]:
+    svg = candidates_plot(diagnosis.result.screened)
+    return svg, "Gain of every candidate.", "What each candidate gains in log likelihood on the windows that choose."
+
+
+def _entries(diagnosis: CaseDiagnosis) -> str:
+    rows = []
+    base = diagnosis.result.baseline
+    for entry in diagnosis.result.entries:
+        named = "yes" if entry in diagnosis.result.confusion else ""
+        left = share_left(entry, base)
+        rows.append([" + ".join(entry.names), number(entry.score - base.score, 4), f"{100 * left:.2g} %", named])
+    return html.table(["finalist", "gain on recordings left out", "misfit left", "named"], rows)
+
+
+def _residuals(diagnosis: CaseDiagnosis) -> tuple[str, str, str]:
+    held = ~diagnosis.chosen
+    y, measured = np.asarray(diagnosis.bench.shots.y)[held], np.asarray(diagnosis.bench.shots.measured)[held]
+    shown = ["baseline", *(["augmented"] if diagnosis.result.verdict in ("explained", "ambiguous") else [])]
+    errors = {name: np.where(measured, y - diagnosis.predictions[name][held], np.nan) for name in shown}
+    noise = diagnosis.result.best.misfit.noise
+    svg = residual_plot(diagnosis.windows.time[held], y, errors, diagnosis.model.channels, noise)
+    caption = (
+        "Left: root mean square error against the time since a prediction started; dotted: the noise. Right: errors of "
+        "the last of them against the measured value, with their median."
+    )
+    return svg, "Residuals against lead time and against the state.", caption
+
+
+def _parameters(diagnosis: CaseDiagnosis) -> str:
+    rows = []
+    table = diagnosis.table()
+    for name, entry in table["parameters"].items():
+        before, after = entry["baseline"], entry["augmented"]
+        shown = [plus_minus(before["mean"], before["sd"]), plus_minus(after["mean"], after["sd"])]
+        rows.append([name, entry["unit"], *shown])
+    for effect in table["effects"]:
+        for name, p in effect["parameters"].items():
+            rows.append([f"{effect['effect']}, {name}", p["unit"], "", plus_minus(p["mean"], p["sd"])])
+    return html.table(["parameter", "unit", "the simulator as it is", "with what was found"], rows)
+
+
+def _settings(diagnosis: CaseDiagnosis, facts: Mapping[str, Any]) -> str:
+    rows = [
+        ["engine", diagnosis.model.system.reason],
+        ["candidates", str(len(diagnosis.bench.pairs))],
+        ["windows that choose, that judge", f"{int(diagnosis.chosen.sum())}, {int((~diagnosis.chosen).sum())}"],
+        ["held out", ", ".join(diagnosis.held_out)],
+        ["p-value of no mismatch", number(diagnosis.result.baseline.misfit.p_value)],
+        *[[str(k), str(v)] for k, v in facts.items() if isinstance(v, (str, int, float))],
+    ]
+    noise = zip(diagnosis.model.channels, diagnosis.result.best.misfit.noise, strict=True)
+    return html.table(["setting", "value"], rows) + html.details(
+        "Estimated noise", html.table(["channel", "standard deviation"], [[c, number(s, 4)] for c, s in noise])
+    )
