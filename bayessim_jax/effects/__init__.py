@@ -14,3 +14,4 @@ from bayessim_jax.effects.places import at as at
 from bayessim_jax.effects.registry import EFFECTS as EFFECTS
 from bayessim_jax.effects.registry import lookup_effect as lookup_effect
 from bayessim_jax.effects.registry import register_effect as register_effect
+from bayessim_jax.effects.scaling import recorded_scales as recorded_scales

@@ -169,7 +169,9 @@ class AugmentedMjcf:
         seen = replace(self.base, engine=self.engine).observe(inner, state.base)
         for k, w in self._at("sense"):
             for c in self._channels_of(w):
-                seen = seen.at[c].set(w.effect.sense(w.values(theta), state.memories[k], seen[c]))
+                seen = seen.at[c].set(
+                    w.effect.sense(w.values(theta), state.memories[k], seen[c], Moment(state.time, self.dt))
+                )
         return seen
 
     def positions(self, state: AugmentedState) -> Float[Array, " nq"]:
@@ -379,7 +381,7 @@ class AugmentedMjcf:
             inertia = grips[joint].inertia if joint in grips else 1.0
             return Moment(state.time, self._h, q, v, accelerations.get(joint, 0.0), inertia, drive)
 
-        moment = of(site.joint, list(site.actuators) or actuators_of(model, site.joint))
+        moment = of(site.joint, list(site.actuators) or actuators_of(model, site.joint))._replace(detail=site.detail)
         return moment if site.other < 0 else moment._replace(other=of(site.other, actuators_of(model, site.other)))
 
     def _actuator_moment(self, numbers: Numbers, state: AugmentedState, site: Site) -> Moment:

@@ -78,6 +78,8 @@ class Scales:
     """Of the body at the place, kg."""
     length: float = 0.3
     """Of the body at the place, m."""
+    friction: float = 1.0
+    """Coefficient of the contact at the place in the model."""
     unit: str = "rad"
     """Of the position."""
 
@@ -135,6 +137,8 @@ class Moment(NamedTuple):
     """What the actuators exert on the joint, N or N m."""
     other: Any = None
     """The same for the second joint of a place that has two."""
+    detail: str = ""
+    """What stands after the `#` of the place."""
 
     @property
     def stop(self) -> Number:
@@ -235,7 +239,7 @@ class SenseEffect(Effect, Protocol):
         """The memory after a control period of `moment.h` that ended in this state."""
         return memory
 
-    def sense(self, values: Values, memory: Memory, reading: Scalar) -> Scalar:
+    def sense(self, values: Values, memory: Memory, reading: Scalar, moment: Moment) -> Scalar:
         """What is shown instead of the true reading."""
         ...
 
