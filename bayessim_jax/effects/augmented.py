@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -135,7 +136,7 @@ class AugmentedMjcf:
         state = AugmentedState(MjcfState(physics, first), (), grips, time)
         state = self._begin_commands(theta, numbers, state, held)
         if past is not None and len(past):
-            state = self._warm(theta, state, jnp.asarray(past, kind))
+            state = self._warm(theta, numbers, state, jnp.asarray(past, kind))
         commands, _ = self._commands(theta, numbers, state, first)
         return self._begin_joints(theta, numbers, inner, state, commands)
 
@@ -150,7 +151,7 @@ class AugmentedMjcf:
         if not early and self._only(early):
             physics = self.engine.replay(inner, state.base.physics, actions, None, self.substeps)
             return self._later(state, actions, physics)
-        rows, memories = self._pass_early(theta, state, actions, early) if early else (None, {})
+        rows, memories = self._pass_early(theta, numbers, state, actions, early) if early else (None, {})
         if rows is not None and self._only(early):
             return self._replay_rows(inner, state, actions, rows, memories)
         period = self._period(theta, numbers, inner, early)
@@ -256,6 +257,8 @@ class AugmentedMjcf:
     ) -> tuple[list[Number], list[Any]]:
         """What arrives at the actuators during the next time step, and the memories after it."""
         commands: list[Number] = [action[k] for k in range(self.actions.size)]
+        if not early:
+            commands = self._limit(numbers, action)
         memories = list(state.memories)
         for k, w in self._at("act"):
             if k in early:
@@ -263,6 +266,15 @@ class AugmentedMjcf:
             moment = self._actuator_moment(numbers, state, w.site)
             commands, memories[k] = self._pass(theta, w, memories[k], commands, moment)
         return commands, memories
+
+    def _limit(self, numbers: Numbers, action: Float[Array, "*rows act"]) -> list[Number]:
+        """The commands within the limits that the model has on them; what becomes of them then has none."""
+        limits, left = self.base.engine.model.actuator_ctrllimited, self.engine.model.actuator_ctrllimited
+        commands: list[Number] = [action[..., k] for k in range(self.actions.size)]
+        for k in np.flatnonzero(limits != left):
+            low, high = (numbers("actuator_ctrlrange", int(k), side) for side in (0, 1))
+            commands[k] = jnp.clip(commands[k], low, high)
+        return commands
 
     def _pass(
         self, theta: Float[Array, " d"], wired: Wired, memory: Any, commands: list[Number], moment: Moment
@@ -309,7 +321,7 @@ class AugmentedMjcf:
     ) -> AugmentedState:
         """Memories of the actuators' effects as after a command that has been held for long."""
         memories: list[Any] = [()] * len(self.effects)
-        commands: list[Number] = [held[k] for k in range(self.actions.size)]
+        commands = self._limit(numbers, held)
         for k, w in self._at("act"):
             moment = self._actuator_moment(numbers, state, w.site)
             memories[k] = _arrays(w.effect.begin(w.values(theta), _pick(commands, w.site), moment), state.time)
@@ -387,10 +399,12 @@ class AugmentedMjcf:
     def _actuator_moment(self, numbers: Numbers, state: AugmentedState, site: Site) -> Moment:
         if site.joint < 0:
             return Moment(state.time, self._h)
-        gear = numbers("actuator_gear", site.actuators[0], 0)
+        actuator = site.actuators[0]
         q = self.engine.qpos(state.base.physics)[int(self.engine.model.jnt_qposadr[site.joint])]
         v = self.engine.qvel(state.base.physics)[self._dof(site.joint)]
-        return Moment(state.time, self._h, gear * q, gear * v)
+        gain = numbers("actuator_gear", actuator, 0) * numbers("actuator_gainprm", actuator, 0)
+        inertias = {j: grip.inertia for (j, _), grip in zip(self.shares, state.grips, strict=True)}
+        return Moment(state.time, self._h, q, v, inertia=inertias.get(site.joint, 1.0), gain=gain)
 
     def _sensor_moment(self, state: AugmentedState, site: Site) -> Moment:
         if site.joint < 0:
@@ -420,11 +434,13 @@ class AugmentedMjcf:
                 qvel = qvel.at[v].set(velocity)
         return qpos, qvel
 
-    def _warm(self, theta: Float[Array, " d"], state: AugmentedState, past: Actions) -> AugmentedState:
+    def _warm(
+        self, theta: Float[Array, " d"], numbers: Numbers, state: AugmentedState, past: Actions
+    ) -> AugmentedState:
         """The memories of the actuators' effects after past commands; those that look at the joint are left alone."""
         begun = replace(state, time=state.time - len(past) * self.dt)
         blind = frozenset(k for k, w in self._at("act") if not w.effect.looks)
-        _, later = self._pass_early(theta, begun, past, blind)
+        _, later = self._pass_early(theta, numbers, begun, past, blind)
         last = jax.tree.map(lambda x: x[-1], later)
         return replace(state, memories=tuple(last.get(k, memory) for k, memory in enumerate(state.memories)))
 
@@ -447,11 +463,16 @@ class AugmentedMjcf:
         return all(e.port == "model" or (e.port == "sense" and not e.remembers) for e in others)
 
     def _pass_early(
-        self, theta: Float[Array, " d"], state: AugmentedState, actions: Actions, early: frozenset[int]
+        self,
+        theta: Float[Array, " d"],
+        numbers: Numbers,
+        state: AugmentedState,
+        actions: Actions,
+        early: frozenset[int],
     ) -> tuple[Float[Array, "periods steps act"], dict[int, Any]]:
         """What has become of the commands at each time step, and the memories after each period."""
         rows = jnp.repeat(actions, self.substeps, axis=0) if self.substeps > 1 else actions
-        columns: list[Any] = [rows[:, k] for k in range(self.actions.size)]
+        columns = self._limit(numbers, rows)
         later = {}
         for k in sorted(early):
             w, moment = self.effects[k], Moment(state.time, self._h)

@@ -12,7 +12,9 @@ __all__ = ["BackEmf"]
 class BackEmf(ActEffect):
     """V ↦ (V − k_e v)/ρ: the torque k_t (V − k_e v)/R of a motor that the model takes as k_t V/R₀, ρ = R/R₀.
 
-    v is the velocity of the transmission (gear · q̇), k_e in units of the command per that, `resistance` is ρ.
+    v is the velocity of the joint, k_e in units of the command per rad/s or m/s, `resistance` is ρ. The voltage against
+    is the mean of before and after the time step, k_e v/(1 + g h/2m) with the damping g = ∂τ/∂V k_e/ρ, which is stable
+    for every k_e.
     """
 
     name = "back_emf"
@@ -28,4 +30,7 @@ class BackEmf(ActEffect):
 
     def command(self, values: Values, memory: Memory, command: Any, moment: Moment) -> tuple[Any, Memory]:
         """What is left of the voltage."""
-        return (command - values["constant"] * moment.velocity) / values["resistance"], memory
+        constant, resistance = values["constant"], values["resistance"]
+        damping = constant * moment.gain / resistance
+        against = constant * moment.velocity / (1.0 + damping * (0.5 * moment.h) / moment.inertia)
+        return (command - against) / resistance, memory

@@ -127,7 +127,7 @@ class Moment(NamedTuple):
     """s since the beginning of the recording."""
     h: float
     position: Number = 0.0
-    """Of the joint, m or rad; at an actuator's command, of its transmission (gear · q)."""
+    """Of the joint, or of the one that the actuator drives, m or rad."""
     velocity: Number = 0.0
     acceleration: Number = 0.0
     """What the joint would do in this time step without the holding effects at it, m/s² or rad/s²."""
@@ -135,6 +135,8 @@ class Moment(NamedTuple):
     """What the joint feels, 1/(M⁻¹)ⱼⱼ, underestimated so that forces computed from it never overshoot."""
     drive: Number = 0.0
     """What the actuators exert on the joint, N or N m."""
+    gain: Number = 1.0
+    """At an actuator's command: N or N m on the joint for one unit of it."""
     other: Any = None
     """The same for the second joint of a place that has two."""
     detail: str = ""

@@ -18,7 +18,8 @@ __all__ = ["recorded_scales"]
 
 ROWS = 200
 """Rows of a recording at which gravity's and the motion's part of the force are looked at."""
-SMALL = 1e-6
+SMALL = 1e-3
+"""The least that positions, speeds, forces and commands are taken to be."""
 
 Rows = Float[np.ndarray, "rows n"]
 
@@ -38,7 +39,7 @@ def recorded_scales(
     if body > 0:
         anchor, along, _ = link_axes(model, body)
         reach = abs(float((np.array(model.body_ipos[body]) - anchor) @ along))
-        size = float(np.sqrt(model.body_inertia[body].max() / max(model.body_mass[body], SMALL)))
+        size = float(np.sqrt(model.body_inertia[body].max() / max(model.body_mass[body], 1e-9)))
         scales |= {"mass": float(model.body_mass[body]), "length": max(reach, size, 1e-3)}
     if joint >= 0:
         scales |= _of_joint(model, joint, qpos, qvel, ctrl)

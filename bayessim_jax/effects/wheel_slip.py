@@ -25,10 +25,8 @@ class WheelSlip(ActEffect):
     name = "wheel_slip"
 
     def choose(self, names: Sequence[str]) -> list[str]:
-        """Pairs of actuators whose names differ by `left` and `right`, or the only two that there are."""
+        """Pairs of actuators whose names differ by `left` and `right`."""
         pairs = [(n, n.replace("left", "right")) for n in names if "left" in n and n.replace("left", "right") in names]
-        if not pairs and len(names) == 2:
-            pairs = [(names[0], names[1])]
         return [f"actuator/{left}#actuator/{right}" for left, right in pairs]
 
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
