@@ -30,14 +30,14 @@ class SoftStop(ForceEffect):
         """The angle q₁, k and d."""
         side = _side(detail(place))
         reach, k = scales.position, 20.0 * scales.force / scales.position
-        low, high = scales.centre - 1.2 * reach, scales.centre + 1.2 * reach
+        low, high = sorted((scales.centre, scales.centre + 1.2 * side * reach))
         damping = 2.0 * (k * scales.inertia) ** 0.5
         unit = f"{scales.force_unit}/{scales.unit}"
         return (
             EffectParameter(
                 "angle", scales.unit, low, high, side * reach + scales.centre, scales.centre + 0.7 * side * reach
             ),
-            EffectParameter("stiffness", unit, 0.0, 10.0 * k, 0.0, 0.2 * k),
+            EffectParameter("stiffness", unit, 0.0, 5.0 * k, 0.0, 0.2 * k),
             EffectParameter("damping", f"{scales.force_unit} s/{scales.unit}", 0.0, 5.0 * damping, 0.0, 0.05 * damping),
         )
 
