@@ -124,9 +124,9 @@ class AugmentedMjcf:
         time = jnp.asarray(time, kind)
         if any(w.effect.remembers for _, w in self._at("sense")):
             seen = AugmentedState(MjcfState(self.engine.init(inner, qpos, qvel), held), (), (), time)
-            qpos, qvel = self._restore(theta, qpos, qvel, time, self._push(inner, seen, held))
+            qpos, qvel = self._restore(theta, qpos, qvel, time, *self._curve(inner, seen, held))
         else:
-            qpos, qvel = self._restore(theta, qpos, qvel, time, jnp.zeros_like(qvel))
+            qpos, qvel = self._restore(theta, qpos, qvel, time, jnp.zeros_like(qvel), jnp.zeros_like(qvel))
         physics = self.engine.init(inner, qpos, qvel)
         inertias = {
             joint: share * probe_inertia(self.engine, inner, self.base.qpos.astype(kind), self._dof(joint))
@@ -342,10 +342,12 @@ class AugmentedMjcf:
         if self._at("force") or remembering:
             kind = state.time.dtype
             ctrl = jnp.stack([jnp.asarray(c, kind) for c in commands]) if commands else state.base.ctrl
-            acceleration = self._push(inner, state, ctrl)
+            acceleration = self._push(inner, state.base.physics, ctrl)
+            jerk = self._curve(inner, state, ctrl)[1] if remembering else acceleration
             for k, w in remembering:
-                moment = self._sensor_moment(state, w.site)._replace(h=self.dt)
-                moment = moment._replace(acceleration=acceleration[self._dof(w.site.joint)])
+                dof = self._dof(w.site.joint)
+                moment = self._sensor_moment(state, w.site)
+                moment = moment._replace(h=self.dt, acceleration=acceleration[dof], jerk=jerk[dof])
                 memories[k] = _arrays(w.effect.begin(w.values(theta), moment), state.time)
             before = [
                 replace(grip, velocity=grip.velocity - self._h / CAUTION * acceleration[self._dof(joint)])
@@ -358,12 +360,18 @@ class AugmentedMjcf:
             memories[k] = _arrays(w.effect.begin(w.values(theta), moment), state.time)
         return replace(state, memories=tuple(memories))
 
-    def _push(
-        self, inner: Float[Array, " e"], state: AugmentedState, ctrl: Float[Array, " act"]
-    ) -> Float[Array, " nv"]:
+    def _push(self, inner: Float[Array, " e"], physics: Any, ctrl: Float[Array, " act"]) -> Float[Array, " nv"]:
         """Accelerations over one time step under a command, without the effects of forces."""
-        after = self.engine.step(inner, state.base.physics, ctrl, None, 1)
-        return (self.engine.qvel(after) - self.engine.qvel(state.base.physics)) / self._h
+        after = self.engine.step(inner, physics, ctrl, None, 1)
+        return (self.engine.qvel(after) - self.engine.qvel(physics)) / self._h
+
+    def _curve(
+        self, inner: Float[Array, " e"], state: AugmentedState, ctrl: Float[Array, " act"]
+    ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
+        """Accelerations, and how they change within a control period."""
+        later = self.engine.step(inner, state.base.physics, ctrl, None, self.substeps)
+        now, then = (self._push(inner, physics, ctrl) for physics in (state.base.physics, later))
+        return now, (then - now) / self.dt
 
     def _accelerations(self, state: AugmentedState) -> dict[int, Number]:
         """What the joints did in the last time step, less what held them: a = (v − v⁻)/h − f⁻/m."""
@@ -419,6 +427,7 @@ class AugmentedMjcf:
         qvel: Float[Array, " nv"],
         time: Scalar,
         acceleration: Float[Array, " nv"],
+        jerk: Float[Array, " nv"],
     ) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
         """The state that these positions and velocities were measured in."""
         seen = {c.name for c in self.channels}
@@ -426,7 +435,7 @@ class AugmentedMjcf:
             if w.site.joint < 0:
                 continue
             q, v = int(self.engine.model.jnt_qposadr[w.site.joint]), self._dof(w.site.joint)
-            moment = Moment(time, self.dt, qpos[q], qvel[v], acceleration[v])
+            moment = Moment(time, self.dt, qpos[q], qvel[v], acceleration[v], jerk=jerk[v])
             position, velocity = w.effect.restore(w.values(theta), moment)
             if not w.place.endswith("/qvel"):
                 qpos = qpos.at[q].set(position)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax.numpy as jnp
+
 from bayessim_jax.effects.contract import ActEffect, EffectParameter, Memory, Moment, Scales, Values
 
 __all__ = ["BackEmf"]
@@ -13,8 +15,7 @@ class BackEmf(ActEffect):
     """V ↦ (V − k_e v)/ρ: the torque k_t (V − k_e v)/R of a motor that the model takes as k_t V/R₀, ρ = R/R₀.
 
     v is the velocity of the joint, k_e in units of the command per rad/s or m/s, `resistance` is ρ. The voltage against
-    is the mean of before and after the time step, k_e v/(1 + g h/2m) with the damping g = ∂τ/∂V k_e/ρ, which is stable
-    for every k_e.
+    takes at most as much as stops the joint within the time step.
     """
 
     name = "back_emf"
@@ -31,6 +32,5 @@ class BackEmf(ActEffect):
     def command(self, values: Values, memory: Memory, command: Any, moment: Moment) -> tuple[Any, Memory]:
         """What is left of the voltage."""
         constant, resistance = values["constant"], values["resistance"]
-        damping = constant * moment.gain / resistance
-        against = constant * moment.velocity / (1.0 + damping * (0.5 * moment.h) / moment.inertia)
-        return (command - against) / resistance, memory
+        most = resistance * moment.inertia / (moment.h * jnp.maximum(jnp.abs(moment.gain), 1e-12))
+        return (command - jnp.minimum(constant, most) * moment.velocity) / resistance, memory

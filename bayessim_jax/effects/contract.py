@@ -137,6 +137,8 @@ class Moment(NamedTuple):
     """What the actuators exert on the joint, N or N m."""
     gain: Number = 1.0
     """At an actuator's command: N or N m on the joint for one unit of it."""
+    jerk: Number = 0.0
+    """How the acceleration changes, where a sensor's effect begins."""
     other: Any = None
     """The same for the second joint of a place that has two."""
     detail: str = ""

@@ -150,7 +150,8 @@ def _payload(spec: mujoco.MjSpec, place: str, values: Values) -> bool:
     anchor, along, _ = link_axes(model, find_body(model, place))
     body = spec.body(at(place).removeprefix("body/"))
     load = body.add_body(name=f"payload_{body.name}", pos=anchor + values["position"] * along)
-    load.explicitinertial, load.mass, load.inertia = True, max(values["mass"], TINY), [TINY, TINY, TINY]
+    load.explicitinertial, load.mass, load.ipos = True, max(values["mass"], TINY), [0.0, 0.0, 0.0]
+    load.inertia = [TINY, TINY, TINY]
     return True
 
 

@@ -24,7 +24,8 @@ class SensorDelay(SenseEffect):
     """q(t) ↦ q(t − T), T any fraction of a control period.
 
     Between the control periods that are remembered q is the cubic with their positions and velocities. A simulation
-    begins where the joint must have been when it was measured T later, by its acceleration then. T in s, 0.1 at most.
+    begins where the joint will be T after it was where it was measured, by its acceleration and its jerk. T in s, 0.1
+    at most.
     """
 
     name = "sensor_delay"
@@ -40,13 +41,9 @@ class SensorDelay(SenseEffect):
         return (EffectParameter("seconds", "s", 0.0, high, 0.0, min(0.015, 0.4 * high)),)
 
     def begin(self, values: Values, moment: Moment) -> Memory:
-        """Positions and velocities of the last control periods, as with the acceleration of now."""
-        a, samples = moment.acceleration, []
-        for k in range(_count(moment.h) + 1):
-            ago = k * moment.h
-            position = moment.position - ago * (moment.velocity - 0.5 * ago * a) if k else moment.position
-            samples.append((position, moment.velocity - ago * a))
-        return tuple(samples)
+        """Positions and velocities of the last control periods, as with the acceleration and the jerk of now."""
+        earlier = (_move(moment, -k * moment.h) for k in range(1, _count(moment.h) + 1))
+        return ((moment.position, moment.velocity), *earlier)
 
     def track(self, values: Values, memory: Memory, moment: Moment) -> Memory:
         """With the latest first."""
@@ -65,12 +62,18 @@ class SensorDelay(SenseEffect):
 
     def restore(self, values: Values, moment: Moment) -> tuple[Number, Number]:
         """Where it is T after it was there."""
-        late, a = values["seconds"], moment.acceleration
-        return moment.position + late * (moment.velocity + 0.5 * late * a), moment.velocity + late * a
+        return _move(moment, values["seconds"])
 
 
 def _count(period: float) -> int:
     return max(1, min(math.ceil(LONGEST / period - 1e-9), MOST))
+
+
+def _move(moment: Moment, time: Number) -> tuple[Number, Number]:
+    """Position and velocity a time later."""
+    a, jerk = moment.acceleration, moment.jerk
+    position = moment.position + time * (moment.velocity + time * (a / 2.0 + time * jerk / 6.0))
+    return position, moment.velocity + time * (a + time * jerk / 2.0)
 
 
 def _pick(memory: Memory, number: Scalar) -> tuple[Any, Any]:
