@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from bayessim_jax.contracts import Box, System
@@ -72,22 +74,29 @@ def _augment(
             raise ValueError(f"{w.effect.name}@{w.place}: this channel is not observed; observe it.")
     edits = [w for w in wired if w.effect.port == "model"]
     engine = system.engine
-    if edits:
-        engine = _rebuild(system, extend_writes(model, engine.writes, edits, size))
-    joints = dict.fromkeys(w.site.joint for w in wired if w.effect.port == "force" and w.site.joint >= 0)
+    driven = sorted({i for w in wired if w.effect.port == "act" for i in w.site.actuators})
+    limited = [i for i in driven if model.actuator_ctrllimited[i]]
+    if edits or limited:
+        engine = _rebuild(system, extend_writes(model, engine.writes, edits, size), limited)
+    looking = [w for w in wired if w.effect.port == "force" or (w.effect.port == "act" and w.effect.looks)]
+    joints = dict.fromkeys(w.site.joint for w in looking if w.site.joint >= 0)
     shares = tuple((j, least_share(model, np.asarray(system.qpos), int(model.jnt_dofadr[j]))) for j in joints)
     return AugmentedMjcf(extend_box(system.parameters, wired), system, engine, wired, shares)
 
 
-def _rebuild(system: MjcfSystem, writes: Sequence[Write]) -> Engine[Any]:
-    """The same engine with other writes."""
+def _rebuild(system: MjcfSystem, writes: Sequence[Write], free: Sequence[int]) -> Engine[Any]:
+    """The same engine with other writes, and without limits on what arrives at some actuators."""
     engine = system.engine
+    model = copy.copy(engine.model)
+    model.actuator_ctrllimited[list(free)] = 0
     if isinstance(engine, TreeEngine):
-        return TreeEngine(engine.model, tuple(writes))
+        return TreeEngine(model, tuple(writes))
     spec = getattr(getattr(engine, "bank", None), "spec", None)
-    return choose_engine(
-        engine.model, writes, engine.name, spec, observed_sensors(engine.model, system.channels)
-    ).engine
+    if spec is not None:
+        spec = spec.copy()
+        for i in free:
+            spec.actuators[i].ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    return choose_engine(model, writes, engine.name, spec, observed_sensors(engine.model, system.channels)).engine
 
 
 def _observed(system: System[Any], place: str) -> Site:

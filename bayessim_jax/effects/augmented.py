@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -123,9 +124,9 @@ class AugmentedMjcf:
         time = jnp.asarray(time, kind)
         if any(w.effect.remembers for _, w in self._at("sense")):
             seen = AugmentedState(MjcfState(self.engine.init(inner, qpos, qvel), held), (), (), time)
-            qpos, qvel = self._restore(theta, qpos, qvel, time, self._push(inner, seen, held))
+            qpos, qvel = self._restore(theta, qpos, qvel, time, *self._curve(inner, seen, held))
         else:
-            qpos, qvel = self._restore(theta, qpos, qvel, time, jnp.zeros_like(qvel))
+            qpos, qvel = self._restore(theta, qpos, qvel, time, jnp.zeros_like(qvel), jnp.zeros_like(qvel))
         physics = self.engine.init(inner, qpos, qvel)
         inertias = {
             joint: share * probe_inertia(self.engine, inner, self.base.qpos.astype(kind), self._dof(joint))
@@ -135,7 +136,7 @@ class AugmentedMjcf:
         state = AugmentedState(MjcfState(physics, first), (), grips, time)
         state = self._begin_commands(theta, numbers, state, held)
         if past is not None and len(past):
-            state = self._warm(theta, state, jnp.asarray(past, kind))
+            state = self._warm(theta, numbers, state, jnp.asarray(past, kind))
         commands, _ = self._commands(theta, numbers, state, first)
         return self._begin_joints(theta, numbers, inner, state, commands)
 
@@ -150,7 +151,7 @@ class AugmentedMjcf:
         if not early and self._only(early):
             physics = self.engine.replay(inner, state.base.physics, actions, None, self.substeps)
             return self._later(state, actions, physics)
-        rows, memories = self._pass_early(theta, state, actions, early) if early else (None, {})
+        rows, memories = self._pass_early(theta, numbers, state, actions, early) if early else (None, {})
         if rows is not None and self._only(early):
             return self._replay_rows(inner, state, actions, rows, memories)
         period = self._period(theta, numbers, inner, early)
@@ -169,7 +170,9 @@ class AugmentedMjcf:
         seen = replace(self.base, engine=self.engine).observe(inner, state.base)
         for k, w in self._at("sense"):
             for c in self._channels_of(w):
-                seen = seen.at[c].set(w.effect.sense(w.values(theta), state.memories[k], seen[c]))
+                seen = seen.at[c].set(
+                    w.effect.sense(w.values(theta), state.memories[k], seen[c], Moment(state.time, self.dt))
+                )
         return seen
 
     def positions(self, state: AugmentedState) -> Float[Array, " nq"]:
@@ -254,6 +257,8 @@ class AugmentedMjcf:
     ) -> tuple[list[Number], list[Any]]:
         """What arrives at the actuators during the next time step, and the memories after it."""
         commands: list[Number] = [action[k] for k in range(self.actions.size)]
+        if not early:
+            commands = self._limit(numbers, action)
         memories = list(state.memories)
         for k, w in self._at("act"):
             if k in early:
@@ -261,6 +266,15 @@ class AugmentedMjcf:
             moment = self._actuator_moment(numbers, state, w.site)
             commands, memories[k] = self._pass(theta, w, memories[k], commands, moment)
         return commands, memories
+
+    def _limit(self, numbers: Numbers, action: Float[Array, "*rows act"]) -> list[Number]:
+        """The commands within the limits that the model has on them; what becomes of them then has none."""
+        limits, left = self.base.engine.model.actuator_ctrllimited, self.engine.model.actuator_ctrllimited
+        commands: list[Number] = [action[..., k] for k in range(self.actions.size)]
+        for k in np.flatnonzero(limits != left):
+            low, high = (numbers("actuator_ctrlrange", int(k), side) for side in (0, 1))
+            commands[k] = jnp.clip(commands[k], low, high)
+        return commands
 
     def _pass(
         self, theta: Float[Array, " d"], wired: Wired, memory: Any, commands: list[Number], moment: Moment
@@ -307,7 +321,7 @@ class AugmentedMjcf:
     ) -> AugmentedState:
         """Memories of the actuators' effects as after a command that has been held for long."""
         memories: list[Any] = [()] * len(self.effects)
-        commands: list[Number] = [held[k] for k in range(self.actions.size)]
+        commands = self._limit(numbers, held)
         for k, w in self._at("act"):
             moment = self._actuator_moment(numbers, state, w.site)
             memories[k] = _arrays(w.effect.begin(w.values(theta), _pick(commands, w.site), moment), state.time)
@@ -328,10 +342,12 @@ class AugmentedMjcf:
         if self._at("force") or remembering:
             kind = state.time.dtype
             ctrl = jnp.stack([jnp.asarray(c, kind) for c in commands]) if commands else state.base.ctrl
-            acceleration = self._push(inner, state, ctrl)
+            acceleration = self._push(inner, state.base.physics, ctrl)
+            jerk = self._curve(inner, state, ctrl)[1] if remembering else acceleration
             for k, w in remembering:
-                moment = self._sensor_moment(state, w.site)._replace(h=self.dt)
-                moment = moment._replace(acceleration=acceleration[self._dof(w.site.joint)])
+                dof = self._dof(w.site.joint)
+                moment = self._sensor_moment(state, w.site)
+                moment = moment._replace(h=self.dt, acceleration=acceleration[dof], jerk=jerk[dof])
                 memories[k] = _arrays(w.effect.begin(w.values(theta), moment), state.time)
             before = [
                 replace(grip, velocity=grip.velocity - self._h / CAUTION * acceleration[self._dof(joint)])
@@ -344,12 +360,18 @@ class AugmentedMjcf:
             memories[k] = _arrays(w.effect.begin(w.values(theta), moment), state.time)
         return replace(state, memories=tuple(memories))
 
-    def _push(
-        self, inner: Float[Array, " e"], state: AugmentedState, ctrl: Float[Array, " act"]
-    ) -> Float[Array, " nv"]:
+    def _push(self, inner: Float[Array, " e"], physics: Any, ctrl: Float[Array, " act"]) -> Float[Array, " nv"]:
         """Accelerations over one time step under a command, without the effects of forces."""
-        after = self.engine.step(inner, state.base.physics, ctrl, None, 1)
-        return (self.engine.qvel(after) - self.engine.qvel(state.base.physics)) / self._h
+        after = self.engine.step(inner, physics, ctrl, None, 1)
+        return (self.engine.qvel(after) - self.engine.qvel(physics)) / self._h
+
+    def _curve(
+        self, inner: Float[Array, " e"], state: AugmentedState, ctrl: Float[Array, " act"]
+    ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
+        """Accelerations, and how they change within a control period."""
+        later = self.engine.step(inner, state.base.physics, ctrl, None, self.substeps)
+        now, then = (self._push(inner, physics, ctrl) for physics in (state.base.physics, later))
+        return now, (then - now) / self.dt
 
     def _accelerations(self, state: AugmentedState) -> dict[int, Number]:
         """What the joints did in the last time step, less what held them: a = (v − v⁻)/h − f⁻/m."""
@@ -379,16 +401,18 @@ class AugmentedMjcf:
             inertia = grips[joint].inertia if joint in grips else 1.0
             return Moment(state.time, self._h, q, v, accelerations.get(joint, 0.0), inertia, drive)
 
-        moment = of(site.joint, list(site.actuators) or actuators_of(model, site.joint))
+        moment = of(site.joint, list(site.actuators) or actuators_of(model, site.joint))._replace(detail=site.detail)
         return moment if site.other < 0 else moment._replace(other=of(site.other, actuators_of(model, site.other)))
 
     def _actuator_moment(self, numbers: Numbers, state: AugmentedState, site: Site) -> Moment:
         if site.joint < 0:
             return Moment(state.time, self._h)
-        gear = numbers("actuator_gear", site.actuators[0], 0)
+        actuator = site.actuators[0]
         q = self.engine.qpos(state.base.physics)[int(self.engine.model.jnt_qposadr[site.joint])]
         v = self.engine.qvel(state.base.physics)[self._dof(site.joint)]
-        return Moment(state.time, self._h, gear * q, gear * v)
+        gain = numbers("actuator_gear", actuator, 0) * numbers("actuator_gainprm", actuator, 0)
+        inertias = {j: grip.inertia for (j, _), grip in zip(self.shares, state.grips, strict=True)}
+        return Moment(state.time, self._h, q, v, inertia=inertias.get(site.joint, 1.0), gain=gain)
 
     def _sensor_moment(self, state: AugmentedState, site: Site) -> Moment:
         if site.joint < 0:
@@ -403,6 +427,7 @@ class AugmentedMjcf:
         qvel: Float[Array, " nv"],
         time: Scalar,
         acceleration: Float[Array, " nv"],
+        jerk: Float[Array, " nv"],
     ) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
         """The state that these positions and velocities were measured in."""
         seen = {c.name for c in self.channels}
@@ -410,7 +435,7 @@ class AugmentedMjcf:
             if w.site.joint < 0:
                 continue
             q, v = int(self.engine.model.jnt_qposadr[w.site.joint]), self._dof(w.site.joint)
-            moment = Moment(time, self.dt, qpos[q], qvel[v], acceleration[v])
+            moment = Moment(time, self.dt, qpos[q], qvel[v], acceleration[v], jerk=jerk[v])
             position, velocity = w.effect.restore(w.values(theta), moment)
             if not w.place.endswith("/qvel"):
                 qpos = qpos.at[q].set(position)
@@ -418,11 +443,13 @@ class AugmentedMjcf:
                 qvel = qvel.at[v].set(velocity)
         return qpos, qvel
 
-    def _warm(self, theta: Float[Array, " d"], state: AugmentedState, past: Actions) -> AugmentedState:
+    def _warm(
+        self, theta: Float[Array, " d"], numbers: Numbers, state: AugmentedState, past: Actions
+    ) -> AugmentedState:
         """The memories of the actuators' effects after past commands; those that look at the joint are left alone."""
         begun = replace(state, time=state.time - len(past) * self.dt)
         blind = frozenset(k for k, w in self._at("act") if not w.effect.looks)
-        _, later = self._pass_early(theta, begun, past, blind)
+        _, later = self._pass_early(theta, numbers, begun, past, blind)
         last = jax.tree.map(lambda x: x[-1], later)
         return replace(state, memories=tuple(last.get(k, memory) for k, memory in enumerate(state.memories)))
 
@@ -445,11 +472,16 @@ class AugmentedMjcf:
         return all(e.port == "model" or (e.port == "sense" and not e.remembers) for e in others)
 
     def _pass_early(
-        self, theta: Float[Array, " d"], state: AugmentedState, actions: Actions, early: frozenset[int]
+        self,
+        theta: Float[Array, " d"],
+        numbers: Numbers,
+        state: AugmentedState,
+        actions: Actions,
+        early: frozenset[int],
     ) -> tuple[Float[Array, "periods steps act"], dict[int, Any]]:
         """What has become of the commands at each time step, and the memories after each period."""
         rows = jnp.repeat(actions, self.substeps, axis=0) if self.substeps > 1 else actions
-        columns: list[Any] = [rows[:, k] for k in range(self.actions.size)]
+        columns = self._limit(numbers, rows)
         later = {}
         for k in sorted(early):
             w, moment = self.effects[k], Moment(state.time, self._h)

@@ -105,7 +105,9 @@ class AugmentedSystem:
         for k, w in enumerate(self.effects):
             if w.effect.port == "sense":
                 c = self.observations.names.index(at(w.place))
-                seen = seen.at[c].set(w.effect.sense(w.values(theta), state.memories[k], seen[c]))
+                seen = seen.at[c].set(
+                    w.effect.sense(w.values(theta), state.memories[k], seen[c], Moment(state.time, self.dt))
+                )
         return seen
 
     def _pass(

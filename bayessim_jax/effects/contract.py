@@ -78,6 +78,8 @@ class Scales:
     """Of the body at the place, kg."""
     length: float = 0.3
     """Of the body at the place, m."""
+    friction: float = 1.0
+    """Coefficient of the contact at the place in the model."""
     unit: str = "rad"
     """Of the position."""
 
@@ -125,7 +127,7 @@ class Moment(NamedTuple):
     """s since the beginning of the recording."""
     h: float
     position: Number = 0.0
-    """Of the joint, m or rad; at an actuator's command, of its transmission (gear · q)."""
+    """Of the joint, or of the one that the actuator drives, m or rad."""
     velocity: Number = 0.0
     acceleration: Number = 0.0
     """What the joint would do in this time step without the holding effects at it, m/s² or rad/s²."""
@@ -133,8 +135,14 @@ class Moment(NamedTuple):
     """What the joint feels, 1/(M⁻¹)ⱼⱼ, underestimated so that forces computed from it never overshoot."""
     drive: Number = 0.0
     """What the actuators exert on the joint, N or N m."""
+    gain: Number = 1.0
+    """At an actuator's command: N or N m on the joint for one unit of it."""
+    jerk: Number = 0.0
+    """How the acceleration changes, where a sensor's effect begins."""
     other: Any = None
     """The same for the second joint of a place that has two."""
+    detail: str = ""
+    """What stands after the `#` of the place."""
 
     @property
     def stop(self) -> Number:
@@ -235,7 +243,7 @@ class SenseEffect(Effect, Protocol):
         """The memory after a control period of `moment.h` that ended in this state."""
         return memory
 
-    def sense(self, values: Values, memory: Memory, reading: Scalar) -> Scalar:
+    def sense(self, values: Values, memory: Memory, reading: Scalar, moment: Moment) -> Scalar:
         """What is shown instead of the true reading."""
         ...
 

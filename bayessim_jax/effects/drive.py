@@ -16,7 +16,15 @@ from bayessim_jax.effects.contract import Number, Numbers
 from bayessim_jax.effects.places import driven_joint
 from bayessim_jax.engines.fields import Write
 
-__all__ = ["CAUTION", "actuator_torque", "actuators_of", "least_share", "probe_inertia", "read_numbers"]
+__all__ = [
+    "CAUTION",
+    "actuator_torque",
+    "actuators_of",
+    "least_share",
+    "nominal_inertia",
+    "probe_inertia",
+    "read_numbers",
+]
 
 CAUTION = 0.7
 """Holding forces oscillate where the inertia is overestimated by more than a third."""

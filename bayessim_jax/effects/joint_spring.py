@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import mujoco
 
 from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Scales, Values
@@ -13,7 +14,8 @@ __all__ = ["JointSpring"]
 class JointSpring(ForceEffect):
     """τ = −k (q − q₀) − k₃ (q − q₀)³.
 
-    k in N m/rad or N/m, q₀ in rad or m, k₃ in N m/rad³ or N/m³.
+    A spring that softens (k₃ < 0) ends where it has no force left. k in N m/rad or N/m, q₀ in rad or m, k₃ in N m/rad³
+    or N/m³.
     """
 
     name = "joint_spring"
@@ -38,4 +40,5 @@ class JointSpring(ForceEffect):
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
         """Towards q₀."""
         stretch = moment.position - values["reference"]
-        return -stretch * (values["stiffness"] + values["cubic"] * (stretch * stretch)), memory
+        stiffness = values["stiffness"] + values["cubic"] * (stretch * stretch)
+        return -stretch * jnp.where(values["cubic"] < 0.0, jnp.maximum(stiffness, 0.0), stiffness), memory

@@ -6,7 +6,20 @@ from dataclasses import dataclass
 
 import mujoco
 
-__all__ = ["Site", "actuators", "at", "detail", "driven_joint", "encoders", "find_site", "joints", "movable_bodies"]
+__all__ = [
+    "Site",
+    "actuator_name",
+    "at",
+    "detail",
+    "driven_joint",
+    "driven_joints",
+    "driving_actuators",
+    "encoders",
+    "find_body",
+    "find_site",
+    "joints",
+    "movable_bodies",
+]
 
 SCALAR = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
 ON_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
@@ -20,6 +33,7 @@ class Site:
     actuators: tuple[int, ...] = ()
     other: int = -1
     """The second joint, where there is one."""
+    detail: str = ""
 
 
 def at(place: str) -> str:
@@ -44,14 +58,30 @@ def encoders(model: mujoco.MjModel) -> list[str]:
     return [f"{joint}/qpos" for joint in joints(model)] + sensors
 
 
-def actuators(model: mujoco.MjModel) -> list[str]:
-    """All actuators."""
-    return [f"actuator/{actuator_name(model, i)}" for i in range(model.nu)]
+def driven_joints(model: mujoco.MjModel) -> list[str]:
+    """Hinges and slides that an actuator drives."""
+    driven = {driven_joint(model, i) for i in range(model.nu)}
+    return [place for place in joints(model) if find_site(model, place).joint in driven]
 
 
-def movable_bodies(model: mujoco.MjModel) -> list[int]:
-    """Bodies with mass that are not fixed to the world."""
-    return [b for b in range(1, model.nbody) if model.body_weldid[b] and model.body_mass[b] > 0.0]
+def driving_actuators(model: mujoco.MjModel) -> list[str]:
+    """Actuators of hinges and slides."""
+    return [f"actuator/{actuator_name(model, i)}" for i in range(model.nu) if driven_joint(model, i) >= 0]
+
+
+def movable_bodies(model: mujoco.MjModel) -> list[str]:
+    """Bodies with a name and a mass that are not fixed to the world."""
+    movable = [b for b in range(1, model.nbody) if model.body_weldid[b] and model.body_mass[b] > 0.0]
+    return [f"body/{model.body(b).name}" for b in movable if model.body(b).name]
+
+
+def find_body(model: mujoco.MjModel, place: str) -> int:
+    """The body of a place, or `ValueError`."""
+    number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, at(place).removeprefix("body/"))
+    if number < 0:
+        known = ", ".join(movable_bodies(model))
+        raise ValueError(f"place {place!r}: the model has no such body; take one of {known}.")
+    return number
 
 
 def driven_joint(model: mujoco.MjModel, actuator: int) -> int:
@@ -68,17 +98,27 @@ def find_site(model: mujoco.MjModel, place: str) -> Site:
     if kind == "joint":
         joint = _find_joint(model, place, name.removesuffix("/qpos").removesuffix("/qvel"))
         second = detail(place).partition("/")[2]
-        return Site(joint, other=_find_joint(model, place, second) if second else -1)
+        return Site(joint, other=_find_joint(model, place, second) if second else -1, detail=detail(place))
     if kind == "actuator":
         pair = [name, *detail(place).split("#")] if detail(place) else [name]
         found = tuple(_find_actuator(model, place, n.removeprefix("actuator/")) for n in pair)
         return Site(driven_joint(model, found[0]), found)
+    if kind == "sensor":
+        return Site(_encoder_joint(model, name))
     return Site()
 
 
 def actuator_name(model: mujoco.MjModel, number: int) -> str:
     """Name of an actuator as systems and recordings give it."""
     return model.actuator(number).name or f"actuator{number}"
+
+
+def _encoder_joint(model: mujoco.MjModel, name: str) -> int:
+    """The joint whose position a sensor shows, or −1."""
+    number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
+    if number < 0 or model.sensor_type[number] != mujoco.mjtSensor.mjSENS_JOINTPOS:
+        return -1
+    return int(model.sensor_objid[number])
 
 
 def _find_joint(model: mujoco.MjModel, place: str, name: str) -> int:
@@ -94,4 +134,5 @@ def _find_actuator(model: mujoco.MjModel, place: str, name: str) -> int:
     for number in range(model.nu):
         if actuator_name(model, number) == name:
             return number
-    raise ValueError(f"place {place!r}: the model has no actuator {name!r}; take one of {', '.join(actuators(model))}.")
+    known = ", ".join(f"actuator/{actuator_name(model, i)}" for i in range(model.nu))
+    raise ValueError(f"place {place!r}: the model has no actuator {name!r}; take one of {known}.")

@@ -14,11 +14,12 @@ __all__ = ["QuadraticDrag"]
 class QuadraticDrag(ForceEffect):
     """τ = −c v|v|.
 
-    c in N m s²/rad² or N s²/m². The force is that of the mean of before and after the time step,
-    −c v|v|/(1 + c|v| h/2m), which is stable for every c.
+    c in N m s²/rad² or N s²/m². v is the mean of the velocities before and after the time step, v + (a + τ/m) h/2, and
+    |v| that before it, which is stable for every c.
     """
 
     name = "quadratic_drag"
+    holds = True
 
     def places(self, model: mujoco.MjModel) -> list[str]:
         """Every hinge and slide."""
@@ -30,6 +31,7 @@ class QuadraticDrag(ForceEffect):
         return (EffectParameter("coefficient", f"{scales.force_unit} s²/{scales.unit}²", 0.0, high, 0.0, 0.1 * high),)
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
-        """−c v|v|."""
-        rate = values["coefficient"] * jnp.abs(moment.velocity)
-        return -rate * moment.velocity / (1.0 + rate * (0.5 * moment.h) / moment.inertia), memory
+        """Against the motion."""
+        rate, half = values["coefficient"] * jnp.abs(moment.velocity), 0.5 * moment.h
+        coasting = moment.velocity + half * moment.acceleration
+        return -rate * coasting / (1.0 + rate * half / moment.inertia), memory

@@ -10,18 +10,37 @@ from bayessim_jax.effects.actuator_deadband import ActuatorDeadband
 from bayessim_jax.effects.actuator_delay import ActuatorDelay
 from bayessim_jax.effects.actuator_gain import ActuatorGain
 from bayessim_jax.effects.actuator_lag import ActuatorLag
+from bayessim_jax.effects.actuator_rate_limit import ActuatorRateLimit
 from bayessim_jax.effects.actuator_saturation import ActuatorSaturation
 from bayessim_jax.effects.armature import Armature
 from bayessim_jax.effects.asymmetric_friction import AsymmetricFriction
+from bayessim_jax.effects.back_emf import BackEmf
+from bayessim_jax.effects.backlash import Backlash
+from bayessim_jax.effects.base_tilt import BaseTilt
+from bayessim_jax.effects.contact_friction import ContactFriction
 from bayessim_jax.effects.contract import Effect
 from bayessim_jax.effects.coulomb_friction import CoulombFriction
+from bayessim_jax.effects.disturbance_event import DisturbanceEvent
+from bayessim_jax.effects.gain_drift import GainDrift
 from bayessim_jax.effects.gain_drop import GainDrop
+from bayessim_jax.effects.ground_slope import GroundSlope
+from bayessim_jax.effects.hysteresis import Hysteresis
+from bayessim_jax.effects.joint_coupling import JointCoupling
+from bayessim_jax.effects.joint_flexibility import JointFlexibility
 from bayessim_jax.effects.joint_spring import JointSpring
+from bayessim_jax.effects.link_offset import LinkOffset
+from bayessim_jax.effects.load_dependent_friction import LoadDependentFriction
+from bayessim_jax.effects.lugre_friction import LuGreFriction
+from bayessim_jax.effects.payload import Payload
 from bayessim_jax.effects.quadratic_drag import QuadraticDrag
+from bayessim_jax.effects.sensor_delay import SensorDelay
 from bayessim_jax.effects.sensor_offset import SensorOffset
 from bayessim_jax.effects.sensor_scale import SensorScale
+from bayessim_jax.effects.soft_stop import SoftStop
 from bayessim_jax.effects.stribeck_friction import StribeckFriction
+from bayessim_jax.effects.torque_ripple import TorqueRipple
 from bayessim_jax.effects.viscous_friction import ViscousFriction
+from bayessim_jax.effects.wheel_slip import WheelSlip
 
 __all__ = ["EFFECTS", "lookup_effect", "register_effect"]
 
@@ -34,18 +53,37 @@ EFFECTS: dict[str, Any] = {
         CoulombFriction(),
         StribeckFriction(),
         AsymmetricFriction(),
+        LoadDependentFriction(),
+        LuGreFriction(),
+        Hysteresis(),
         QuadraticDrag(),
         JointSpring(),
+        SoftStop(),
+        TorqueRipple(),
+        JointFlexibility(),
+        Backlash(),
         Armature(),
+        Payload(),
+        BaseTilt(),
+        LinkOffset(),
         ActuatorGain(),
         ActuatorBias(),
         ActuatorDelay(),
         ActuatorLag(),
         ActuatorSaturation(),
+        ActuatorRateLimit(),
         ActuatorDeadband(),
+        BackEmf(),
         GainDrop(),
+        GainDrift(),
+        DisturbanceEvent(),
         SensorOffset(),
         SensorScale(),
+        SensorDelay(),
+        ContactFriction(),
+        GroundSlope(),
+        WheelSlip(),
+        JointCoupling(),
     )
 }
 

@@ -25,7 +25,7 @@ class SensorOffset(SenseEffect):
         reach = scales.position
         return (EffectParameter("offset", scales.unit, -0.5 * reach, 0.5 * reach, 0.0, 0.03 * reach),)
 
-    def sense(self, values: Values, memory: Memory, reading: Scalar) -> Scalar:
+    def sense(self, values: Values, memory: Memory, reading: Scalar, moment: Moment) -> Scalar:
         """The sum q + q₀."""
         return reading + values["offset"]
 

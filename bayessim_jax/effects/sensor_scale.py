@@ -27,7 +27,7 @@ class SensorScale(SenseEffect):
         """The scale k."""
         return (EffectParameter("scale", "", 0.5, 2.0, 1.0, 1.05),)
 
-    def sense(self, values: Values, memory: Memory, reading: Scalar) -> Scalar:
+    def sense(self, values: Values, memory: Memory, reading: Scalar, moment: Moment) -> Scalar:
         """The product k q."""
         return values["scale"] * reading
 

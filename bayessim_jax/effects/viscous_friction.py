@@ -13,11 +13,12 @@ __all__ = ["ViscousFriction"]
 class ViscousFriction(ForceEffect):
     """τ = −b v.
 
-    b in N m s/rad or N s/m. The force is that of the mean of the velocities before and after the time step,
-    −b v/(1 + b h/2m), which is stable for every b.
+    b in N m s/rad or N s/m. v is the mean of the velocities before and after the time step, v + (a + τ/m) h/2, which
+    is stable for every b.
     """
 
     name = "viscous_friction"
+    holds = True
 
     def places(self, model: mujoco.MjModel) -> list[str]:
         """Every hinge and slide."""
@@ -29,6 +30,7 @@ class ViscousFriction(ForceEffect):
         return (EffectParameter("viscous", f"{scales.force_unit} s/{scales.unit}", 0.0, high, 0.0, 0.1 * high),)
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
-        """−b v."""
-        b = values["viscous"]
-        return -b * moment.velocity / (1.0 + b * (0.5 * moment.h) / moment.inertia), memory
+        """Against the motion."""
+        b, half = values["viscous"], 0.5 * moment.h
+        coasting = moment.velocity + half * moment.acceleration
+        return -b * coasting / (1.0 + b * half / moment.inertia), memory

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mujoco
 
-__all__ = ["find_contact"]
+__all__ = ["find_contact", "find_partners"]
 
 
 def find_contact(model: mujoco.MjModel) -> tuple[str, str] | None:
@@ -14,12 +14,18 @@ def find_contact(model: mujoco.MjModel) -> tuple[str, str] | None:
         return None
     if model.npair:
         return _name(model, int(model.pair_geom1[0])), _name(model, int(model.pair_geom2[0]))
-    excluded = {int(signature) for signature in model.exclude_signature}
     for one in range(model.ngeom):
-        for two in range(one):
-            if _masks_meet(model, one, two) and _bodies_meet(model, one, two, excluded):
+        for two in find_partners(model, one):
+            if two < one:
                 return _name(model, two), _name(model, one)
     return None
+
+
+def find_partners(model: mujoco.MjModel, geom: int) -> list[int]:
+    """The geoms that MuJoCo's filters let one collide with, named pairs aside."""
+    excluded = {int(signature) for signature in model.exclude_signature}
+    others = [other for other in range(model.ngeom) if other != geom]
+    return [o for o in others if _masks_meet(model, geom, o) and _bodies_meet(model, geom, o, excluded)]
 
 
 def _masks_meet(model: mujoco.MjModel, one: int, two: int) -> bool:

@@ -1,0 +1,59 @@
+"""Play between a motor and the joint that it drives."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import mujoco
+
+from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Scales, Values
+from bayessim_jax.effects.places import driving_actuators
+
+__all__ = ["Backlash"]
+
+
+class Backlash(ForceEffect):
+    """J θ̈ = τ_m − λ, |θ − q| ≤ g/2: the motor turns freely within the gap, and meshes without bouncing at its ends.
+
+    The joint feels λ in place of the motor's τ_m. λ is what brings the two to the end of the gap within the time step,
+    λ = μ (x' ∓ g/2)/h² with 1/μ = 1/J + 1/m and x' their distance as it would be without λ; it never pulls. It acts on
+    the actuator's side and needs the motion of the joint, so its port is `force` and its place the actuator. Without a
+    rotor (J = 0) the motor crosses the gap in no time, and λ = τ_m. g in rad or m, J in kg m² or kg, at the joint.
+    """
+
+    name = "backlash"
+    holds = True
+
+    def places(self, model: mujoco.MjModel) -> list[str]:
+        """Every actuator of a hinge or slide."""
+        return driving_actuators(model)
+
+    def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
+        """The gap g and the rotor's inertia J."""
+        inertia = scales.inertia
+        return (
+            EffectParameter("gap", scales.unit, 0.0, 0.5 * scales.position, 0.0, 0.03 * scales.position),
+            EffectParameter("rotor_inertia", scales.inertia_unit, 0.0, inertia, 0.0, 0.1 * inertia),
+        )
+
+    def begin(self, values: Values, moment: Moment) -> Memory:
+        """θ and θ̇ of a motor that moves with the joint, at the end of the gap to which it presses."""
+        load = _rigid(values, moment)
+        return moment.position + 0.5 * values["gap"] * jnp.sign(load), moment.velocity
+
+    def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
+        """λ − τ_m."""
+        angle, speed = memory
+        rotor, m, h = values["rotor_inertia"], moment.inertia, moment.h
+        ahead = (angle - moment.position) + h * (speed - moment.velocity)
+        stiff, half = rotor * m / (rotor + m) / h**2, 0.5 * values["gap"]
+        load = _rigid(values, moment)
+        meshing = jnp.maximum(stiff * (ahead - half) + load, 0.0) + jnp.minimum(stiff * (ahead + half) + load, 0.0)
+        after = speed + h * (moment.drive - meshing) / jnp.maximum(rotor, 1e-6 * m)
+        return meshing - moment.drive, (angle + h * after, after)
+
+
+def _rigid(values: Values, moment: Moment) -> Number:
+    """What passes from motor to joint while the two accelerate as one."""
+    rotor, m = values["rotor_inertia"], moment.inertia
+    share = m / (rotor + m)
+    return share * moment.drive - rotor * share * (moment.acceleration - moment.drive / m)

@@ -1,0 +1,42 @@
+"""A push from outside, once."""
+
+from __future__ import annotations
+
+import math
+
+import jax.numpy as jnp
+import mujoco
+
+from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Scales, Values
+from bayessim_jax.effects.places import joints
+
+__all__ = ["DisturbanceEvent"]
+
+
+class DisturbanceEvent(ForceEffect):
+    """τ = (2 P/w) sin²(π (t − t₀)/w) for t₀ < t < t₁, w = t₁ − t₀: a bump that hands over the impulse P.
+
+    The shape of the push is unknown; a bump without corners stands for it. t in s since the beginning of the recording,
+    P in N m s or N s.
+    """
+
+    name = "disturbance_event"
+
+    def places(self, model: mujoco.MjModel) -> list[str]:
+        """Every hinge and slide."""
+        return joints(model)
+
+    def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
+        """t₀, t₁ and P."""
+        duration, impulse = scales.duration, 4.0 * scales.inertia * scales.speed
+        return (
+            EffectParameter("start", "s", 0.0, duration, 0.45 * duration, 0.45 * duration),
+            EffectParameter("end", "s", 0.0, duration, 0.55 * duration, 0.55 * duration),
+            EffectParameter("impulse", f"{scales.force_unit} s", -impulse, impulse, 0.0, 0.05 * impulse),
+        )
+
+    def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
+        """The bump in the middle of the time step."""
+        width = jnp.maximum(values["end"] - values["start"], 3.0 * moment.h)
+        phase = jnp.clip((moment.time + 0.5 * moment.h - values["start"]) / width, 0.0, 1.0)
+        return values["impulse"] / width * (1.0 - jnp.cos(2.0 * math.pi * phase)), memory

@@ -1,0 +1,357 @@
+"""What each effect does to a machine, against its closed form."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from bayessim_jax.effects import EFFECTS, Scales, with_effects, write_mjcf
+from bayessim_jax.effects.mjcf_edits import WRITERS
+from bayessim_jax.systems.mjcf import mjcf_system
+from tests.effects.benches import arm, cart, chirp, pendulum, run, simulate, system
+
+MASS = 2.0
+RAIL = "joint/rail"
+
+
+@pytest.fixture(autouse=True)
+def _in_float64():
+    with jax.enable_x64(True):
+        yield
+
+
+def ride(effects, values, actions, q=0.0, v=0.0, timestep=0.002, gravity="0 0 -9.81", **begin):
+    """Position and velocity of the cart after each control period of 10 ms."""
+    base = system(cart(timestep, gravity), "cart")
+    seen = run(base, effects, values, np.asarray(actions), q, v, MASS, **begin)
+    return np.asarray(seen[:, 0]), np.asarray(seen[:, 1])
+
+
+def push(force, steps=300):
+    return np.full((steps, 1), force)
+
+
+def test_viscous_friction_and_drag_end_at_their_terminal_velocities():
+    _, v = ride([("viscous_friction", RAIL)], [4.0], push(6.0, 600))
+    assert v[-1] == pytest.approx(6.0 / 4.0, rel=1e-4)
+    assert v[49] == pytest.approx(1.5 * (1 - np.exp(-0.5 * 4.0 / MASS)), rel=1e-3)
+    _, v = ride([("quadratic_drag", RAIL)], [4.0], push(6.0, 600))
+    assert v[-1] == pytest.approx(np.sqrt(6.0 / 4.0), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("coulomb_friction", [3.0]),
+        ("stribeck_friction", [3.0, 3.0, 0.1]),
+        ("asymmetric_friction", [3.0, 1.0]),
+        ("load_dependent_friction", [3.0, 0.2]),
+    ],
+)
+def test_dry_friction_takes_force_times_distance_and_then_holds(name, values):
+    q, v = ride([(name, RAIL)], values, push(0.0), v=1.5)
+    assert q[-1] == pytest.approx(0.5 * MASS * 1.5**2 / 3.0, rel=0.01)
+    assert np.abs(v[-100:]).max() < 1e-12
+
+
+@pytest.mark.parametrize("name", ["coulomb_friction", "stribeck_friction", "asymmetric_friction"])
+@pytest.mark.parametrize("ratio", [0.5, 0.95, 1.05, 2.0])
+def test_friction_holds_on_a_slope_up_to_its_level_and_not_beyond(name, ratio):
+    pull = 3.0 * MASS
+    level = pull / ratio
+    values = {"coulomb_friction": [level], "stribeck_friction": [level, level, 0.1]}.get(name, [level, level])
+    q, v = ride([(name, RAIL)], values, push(0.0), gravity="3 0 -9.81")
+    if ratio < 1.0:
+        assert np.abs(v).max() < 1e-10
+        assert np.abs(q).max() < 1e-10
+    else:
+        assert v[-1] == pytest.approx((pull - level) / MASS * 3.0, rel=0.01)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_friction_holds_a_pendulum_against_gravity_without_creep(dtype):
+    with jax.enable_x64(dtype == "float64"):
+        base = system(pendulum(), "bob")
+        load = 0.5 * 9.81 * 0.3 * np.sin(0.8)
+        seen = run(base, [("coulomb_friction", "joint/hinge")], [1.05 * load], push(0.0, 1000), 0.8, 0.0)
+        assert np.abs(seen[:, 1]).max() < 1e-5
+        assert np.abs(seen[:, 0] - 0.8).max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "tolerance"),
+    [
+        ("coulomb_friction", [0.2], 0.01),
+        ("asymmetric_friction", [0.3, 0.1], 0.01),
+        ("load_dependent_friction", [0.1, 0.1], 0.01),
+        ("stribeck_friction", [0.1, 0.3, 0.3], 0.03),
+        ("lugre_friction", [50.0, 0.5, 0.1, 0.2, 0.3], 0.03),
+        ("hysteresis", [10.0, 1.0, 20.0, 2.0, 1.1], 0.02),
+        ("viscous_friction", [0.1], 0.01),
+        ("quadratic_drag", [0.1], 0.01),
+        ("soft_stop", [0.4, 30.0, 0.1], 0.04),
+        ("joint_flexibility", [8.0, 0.02, 0.01], 0.02),
+        ("backlash", [0.1, 0.01], 0.03),
+    ],
+)
+def test_a_fiftieth_of_the_time_step_gives_the_same_motion(name, values, tolerance):
+    place = {"backlash": "actuator/m", "soft_stop": "joint/hinge#upper"}.get(name, "joint/hinge")
+    actions = chirp(150, force=0.7)
+    coarse, fine = (
+        np.asarray(run(system(pendulum(h), "bob"), [(name, place)], values, actions, 0.2, 0.0)) for h in (2e-3, 4e-5)
+    )
+    assert np.sqrt(((coarse - fine) ** 2).mean(0) / fine.var(0)).max() < tolerance
+
+
+def test_stribeck_friction_breaks_away_at_its_static_level_and_slides_at_its_coulomb_level():
+    effects, values = [("stribeck_friction", RAIL)], [1.0, 3.0, 0.05]
+    assert np.abs(ride(effects, values, push(2.9))[0]).max() < 1e-9
+    _, v = ride(effects, values, push(3.1))
+    assert (v[-1] - v[-101]) == pytest.approx((3.1 - 1.0) / MASS, rel=0.01)
+
+
+def test_load_dependent_friction_grows_with_the_motor_s_force():
+    _, v = ride([("load_dependent_friction", RAIL)], [0.5, 0.25], push(8.0))
+    assert v[-1] == pytest.approx((8.0 - 0.5 - 0.25 * 8.0) / MASS * 3.0, rel=1e-3)
+
+
+def test_bristles_bend_before_they_slip():
+    values = [1000.0, 60.0, 2.0, 3.0, 0.1]
+    q, _ = ride([("lugre_friction", RAIL)], values, np.concatenate([push(0.0, 1), push(1.0, 600)]))
+    assert q[-1] == pytest.approx(-3.0 / 1000.0 * np.log(1.0 - 1.0 / 3.0), rel=0.1)
+    _, v = ride([("lugre_friction", RAIL)], values, push(5.0, 600))
+    assert v[-1] - v[-101] == pytest.approx((5.0 - 2.0) / MASS, rel=0.01)
+
+
+def test_hysteresis_ends_at_the_force_of_its_last_deflection():
+    stiffness, beta, gamma = 200.0, 40.0, 10.0
+    q, v = ride([("hysteresis", RAIL)], [stiffness, 1.0, beta, gamma, 1.0], push(8.0, 400))
+    assert v[-1] - v[-101] == pytest.approx((8.0 - stiffness / (beta + gamma)) / MASS, rel=0.01)
+    energy = 0.5 * MASS * v[-1] ** 2
+    assert energy < 8.0 * q[-1] - 0.9 * stiffness / (beta + gamma) * q[-1]
+
+
+def test_a_spring_sets_the_frequency():
+    q, _ = ride([("joint_spring", RAIL)], [50.0, 0.1, 0.0], push(0.0, 400), q=0.3)
+    time = 0.01 * np.arange(1, 401)
+    np.testing.assert_allclose(q, 0.1 + 0.2 * np.cos(np.sqrt(50.0 / MASS) * time), atol=0.01)
+
+
+def test_a_stop_gives_as_much_as_it_is_pressed():
+    q, _ = ride([("soft_stop", RAIL + "#upper")], [0.2, 500.0, 60.0], push(5.0, 600))
+    assert q[-1] == pytest.approx(0.2 + 5.0 / 500.0, abs=1e-5)
+    q, _ = ride([("soft_stop", RAIL + "#lower")], [-0.2, 500.0, 60.0], push(-5.0, 600))
+    assert q[-1] == pytest.approx(-0.2 - 5.0 / 500.0, abs=1e-5)
+    free, _ = ride([("soft_stop", RAIL + "#lower")], [-0.2, 500.0, 60.0], push(5.0))
+    np.testing.assert_array_equal(free, ride([], [], push(5.0))[0])
+
+
+def test_ripple_is_a_sine_of_the_position():
+    _, v = ride([("torque_ripple", RAIL)], [3.0, 20.0, 0.4], push(0.0, 1), q=0.13, timestep=0.01)
+    assert v[0] == pytest.approx(0.01 * 3.0 * np.sin(20.0 * 0.13 + 0.4) / MASS, rel=1e-9)
+
+
+def test_a_flexible_joint_rings_at_its_frequency_about_the_stiff_motion():
+    stiffness, rotor = 400.0, 0.5
+    _, v = ride([("joint_flexibility", RAIL)], [stiffness, 0.0, rotor], push(1.0, 300), timestep=0.0005)
+    time = 0.01 * np.arange(1, 301)
+    rest = v - time / (MASS + rotor)
+    spectrum = np.abs(np.fft.rfft((rest - rest.mean()) * np.hanning(300), 8192))
+    frequency = np.fft.rfftfreq(8192, 0.01)[spectrum.argmax()]
+    assert frequency == pytest.approx(np.sqrt(stiffness * (1 / MASS + 1 / rotor)) / (2 * np.pi), rel=0.05)
+    assert v[-1] / time[-1] == pytest.approx(1.0 / (MASS + rotor), rel=0.05)
+
+
+def test_backlash_loses_motion_at_a_reversal():
+    gap, rotor, force = 0.02, 0.5, 2.0
+    there = np.concatenate([push(force, 100), push(-force, 200)])
+    _, v = ride([("backlash", "actuator/m")], [gap, rotor], there)
+    assert v[50] - v[40] == pytest.approx(0.1 * force / (MASS + rotor), rel=1e-3)
+    crossing = np.sqrt(2 * gap * rotor / force)
+    free = v[100 : 100 + int(crossing / 0.01) - 1]
+    assert np.ptp(free) < 1e-6
+    assert v[-1] - v[-11] == pytest.approx(-0.1 * force / (MASS + rotor), rel=1e-3)
+    stiff = ride([("armature", RAIL)], [rotor], there)[0]
+    tight = ride([("backlash", "actuator/m")], [0.0, rotor], there)[0]
+    np.testing.assert_allclose(tight, stiff, atol=5e-3)
+
+
+def test_armature_is_inertia_of_the_joint_alone():
+    _, v = ride([("armature", RAIL)], [3.0], push(5.0, 100))
+    assert v[-1] == pytest.approx(5.0 / (MASS + 3.0), rel=1e-9)
+
+
+def test_a_tilted_base_moves_the_equilibrium():
+    base = system(pendulum(), "bob")
+    pair = [("base_tilt", "world#joint/hinge"), ("viscous_friction", "joint/hinge")]
+    seen = run(base, pair, [0.1, 0.5], push(0.0, 1500), 0.0, 0.0)
+    assert abs(seen[-1, 0]) == pytest.approx(0.1, abs=1e-4)
+
+
+def test_an_actuator_s_effects_are_what_they_say_of_the_command():
+    u = chirp(100, force=2.0)
+    time = 0.01 * np.arange(100)[:, None]
+    cases = {
+        "actuator_gain": ([0.7], 0.7 * u),
+        "actuator_bias": ([0.3], u + 0.3),
+        "actuator_saturation": ([1.2], np.clip(u, -1.2, 1.2)),
+        "actuator_deadband": ([0.4], np.sign(u) * np.maximum(np.abs(u) - 0.4, 0.0)),
+        "gain_drop": ([0.5, 0.6], np.where(time < 0.5 - 1e-9, u, 0.6 * u)),
+        "actuator_delay": ([0.03], np.concatenate([u[:1], u[:1], u[:1], u[:-3]])),
+    }
+    for name, (values, commands) in cases.items():
+        ours, _ = ride([(name, "actuator/m")], values, u)
+        np.testing.assert_allclose(ours, ride([], [], commands)[0], atol=1e-9, err_msg=name)
+    half, _ = ride([("actuator_delay", "actuator/m")], [0.005], u, timestep=0.01)
+    np.testing.assert_allclose(half, ride([], [], (u + np.concatenate([u[:1], u[:-1]])) / 2, timestep=0.01)[0])
+
+
+def test_drift_starts_at_the_beginning_of_the_recording():
+    u = chirp(50)
+    late, _ = ride([("gain_drift", "actuator/m")], [0.2], u, timestep=0.01, time=3.0)
+    commands = u * (1 + 0.2 * (3.0 + 0.01 * np.arange(50)[:, None]))
+    np.testing.assert_allclose(late, ride([], [], commands, timestep=0.01)[0], rtol=1e-9)
+
+
+def test_a_lag_answers_a_step_exponentially():
+    _, v = ride([("actuator_lag", "actuator/m")], [0.2], push(4.0, 100), past=np.zeros((1, 1)))
+    time = 0.01 * np.arange(1, 101)
+    np.testing.assert_allclose(v, 4.0 / MASS * (time - 0.2 * (1 - np.exp(-time / 0.2))), atol=1e-9)
+
+
+def test_a_rate_limit_makes_a_ramp_of_a_step():
+    _, v = ride([("actuator_rate_limit", "actuator/m")], [10.0], push(4.0, 60), past=np.zeros((1, 1)))
+    ramp = np.minimum(10.0 * 0.002 * np.arange(1, 301), 4.0)
+    np.testing.assert_allclose(v, np.cumsum(ramp)[4::5] * 0.002 / MASS, atol=1e-12)
+
+
+def test_back_emf_sets_the_speed_without_load():
+    _, v = ride([("back_emf", "actuator/m")], [2.0, 1.0], push(3.0, 1000))
+    assert v[-1] == pytest.approx(3.0 / 2.0, rel=1e-4)
+    _, v = ride([("back_emf", "actuator/m")], [0.0, 2.0], push(3.0, 100))
+    assert v[-1] == pytest.approx(3.0 / 2.0 / MASS, rel=1e-9)
+
+
+def test_an_event_hands_over_its_impulse_and_nothing_before_or_after():
+    _, v = ride([("disturbance_event", RAIL)], [0.31, 0.52, 3.0], push(0.0, 100))
+    assert np.abs(v[:31]).max() == 0.0
+    np.testing.assert_allclose(v[53:], 3.0 / MASS, rtol=1e-6)
+
+
+def test_sensors_show_what_they_are_said_to_and_states_begin_as_measured():
+    u, channel = chirp(100), RAIL + "/qpos"
+    true, _ = ride([], [], u, q=0.2, v=0.5)
+    shown, _ = ride([("sensor_offset", channel)], [0.07], u, q=0.27, v=0.5)
+    np.testing.assert_allclose(shown, true + 0.07, atol=1e-12)
+    shown, _ = ride([("sensor_scale", channel)], [1.1], u, q=0.22, v=0.5)
+    np.testing.assert_allclose(shown, 1.1 * true, atol=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0.01, 0.023, 0.05])
+def test_a_late_sensor_shows_what_was(delay):
+    base = mjcf_system(pendulum(), [], observe=["joint/hinge/qpos"], substeps=5, engine="tree")
+    fine = mjcf_system(pendulum(1e-4), [], engine="tree")
+    bare = jnp.zeros(0)
+    begun = fine.begin(bare, jnp.array([0.9]), jnp.array([0.0]))
+    path = fine.replay(bare, begun, jnp.zeros((20000, 1))).physics
+    measured = 3000 - round(delay / 1e-4)
+    augmented = with_effects(base, [(EFFECTS["sensor_delay"], "joint/hinge/qpos")], Scales())
+    start = (float(x[0][measured]) for x in (path.qpos, path.qvel))
+    seen = simulate(augmented, np.zeros((100, 1)), *start)(jnp.array([delay]))
+    assert np.abs(seen[:, 0] - path.qpos[0][measured + 100 * np.arange(1, 101)]).max() < 0.01
+
+
+def test_slip_slows_a_vehicle_and_its_turning():
+    left, right = EFFECTS["wheel_slip"].command({"longitudinal": 0.1, "lateral": 0.4}, (), (1.0, 3.0), None)[0]
+    assert (left + right) / 2 == pytest.approx(0.9 * 2.0)
+    assert (right - left) / 2 == pytest.approx(0.6 * 1.0)
+    assert EFFECTS["wheel_slip"].choose(["left_wheel", "right_wheel"]) == ["actuator/left_wheel#actuator/right_wheel"]
+
+
+def test_a_coupled_joint_feels_the_other_s_motor():
+    base, actions = system(arm(), "lower"), np.tile([0.4, 0.0], (50, 1))
+    ours = run(base, [("joint_coupling", "joint/elbow#torque/shoulder")], [0.3], actions, [0.1, 0.2], [0.0, 0.0])
+    both = run(base, [], [], np.tile([0.4, 0.12], (50, 1)), [0.1, 0.2], [0.0, 0.0])
+    np.testing.assert_allclose(ours, both, atol=1e-12)
+
+
+BOX = (
+    '<mujoco><option timestep="0.002" cone="elliptic" impratio="100"/><worldbody>'
+    '<geom name="floor" type="plane" size="5 5 1" friction="0.8 0 0"/>'
+    '<body name="box" pos="0 0 0.1"><joint name="x" type="slide" axis="1 0 0"/>'
+    '<joint name="z" type="slide" axis="0 0 1" damping="300"/>'
+    '<joint name="tip" axis="0 1 0" stiffness="1000" damping="10"/>'
+    '<geom name="crate" type="box" size="0.2 0.2 0.1" mass="1" friction="0.8 0 0"/></body></worldbody></mujoco>'
+)
+
+
+def test_contact_friction_and_slope_of_the_ground():
+    base = mjcf_system(BOX, [], substeps=5, engine="mujoco")
+
+    def slide(name, place, value, speed=8.0):
+        augmented = with_effects(base, [(EFFECTS[name], place)], Scales(friction=0.8))
+        theta, actions = jnp.array([value]), jnp.zeros((50, 0))
+        state = augmented.begin(theta, base.qpos, jnp.array([speed, 0.0, 0.0]))
+        return np.asarray(augmented.velocities(augmented.replay(theta, state, actions)))[:, 0]
+
+    for coefficient in (0.2, 0.8, 1.2):
+        v = slide("contact_friction", "geom/crate", coefficient)
+        assert v[9] - v[44] == pytest.approx(coefficient * 9.81 * 0.35, rel=0.15)
+        spec = mujoco.MjSpec.from_string(BOX)
+        assert write_mjcf(spec, EFFECTS["contact_friction"], "geom/crate", {"coefficient": coefficient})
+        written = mjcf_system(spec, [], substeps=5, engine="mujoco")
+        bare = jnp.zeros(0)
+        begun = written.begin(bare, base.qpos, jnp.array([8.0, 0.0, 0.0]))
+        np.testing.assert_allclose(v, written.replay(bare, begun, jnp.zeros((50, 0))).physics.qvel[:, 0], atol=1e-9)
+    v = slide("ground_slope", "world#joint/tip", 0.5)
+    u = slide("ground_slope", "world#joint/tip", -0.5)
+    assert abs((v[30] - v[10]) - (u[30] - u[10])) == pytest.approx(2 * 9.81 * np.sin(0.5) * 0.2, rel=0.1)
+
+
+WRITTEN = {
+    "viscous_friction": ("joint/elbow", [0.05]),
+    "quadratic_drag": ("joint/elbow", [0.02]),
+    "coulomb_friction": ("joint/elbow", [0.1]),
+    "joint_spring": ("joint/elbow", [2.0, 0.1, 0.5]),
+    "armature": ("joint/elbow", [0.05]),
+    "payload": ("body/lower", [0.2, 0.4]),
+    "link_offset": ("body/lower", [0.05]),
+    "base_tilt": ("world#joint/shoulder", [0.2]),
+    "actuator_gain": ("actuator/m0", [1.3]),
+    "actuator_bias": ("actuator/m0", [0.2]),
+    "actuator_saturation": ("actuator/m0", [0.4]),
+    "actuator_lag": ("actuator/m0", [0.05]),
+    "actuator_delay": ("actuator/m0", [0.0131]),
+    "back_emf": ("actuator/m0", [0.1, 1.2]),
+}
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_model_with_the_effect_written_in_moves_as_the_simulator_with_the_effect(name):
+    place, values = WRITTEN[name]
+    base = mjcf_system(arm(), [], substeps=5, engine="tree")
+    augmented = with_effects(base, [(EFFECTS[name], place)], Scales())
+    actions = chirp(60, actuators=2)
+    ours = simulate(augmented, actions, [0.3, 0.3], [0.0, 0.0])(jnp.array(values))
+    spec = mujoco.MjSpec.from_string(arm())
+    names = [p.name for p in augmented.effects[0].parameters]
+    assert write_mjcf(spec, EFFECTS[name], place, dict(zip(names, values, strict=True)))
+    model = spec.compile()
+    data, rows = mujoco.MjData(model), []
+    data.qpos[:] = 0.3
+    for action in actions:
+        data.ctrl[:] = action
+        for _ in range(5):
+            mujoco.mj_step(model, data)
+        rows.append([*data.qpos, *data.qvel])
+    nq = np.sqrt(((np.asarray(ours) - rows) ** 2).mean(0) / np.var(rows, axis=0)).max()
+    assert nq < 0.03
+
+
+def test_what_mjcf_cannot_say_is_left_alone():
+    spec = mujoco.MjSpec.from_string(arm())
+    before = spec.to_xml()
+    for name in set(EFFECTS) - set(WRITERS):
+        assert not write_mjcf(spec, EFFECTS[name], "joint/elbow", {})
+    assert spec.to_xml() == before
