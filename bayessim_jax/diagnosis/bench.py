@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from bayessim_jax.beliefs.margins import Margin, Margins, log_uniform, uniform
 from bayessim_jax.effects import Scales, at, with_effects
 from bayessim_jax.inference.replay import Inputs, replay_window
-from bayessim_jax.inference.shooting import Fit, Shots, expand, solve
+from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Fit, Shots, expand, solve
 from bayessim_jax.systems.mjcf import MjcfSystem
 
 __all__ = ["Bench", "Candidate", "Trial"]
@@ -136,7 +136,8 @@ class Bench:
         columns = self.columns(candidate)
         begin = np.array([float(self.each[i].standard(jnp.asarray(self.parameters[i].start, float))) for i in columns])
         rest = np.zeros(self.slots - len(columns))
-        both = [begin] if not columns else [begin, -begin]
+        signed = any(self.parameters[i].low < 0.0 for i in columns)
+        both = [begin, -begin] if signed else [begin]
         return [jnp.concatenate([z, jnp.asarray(x), jnp.asarray(rest)]) for x in both]
 
     def free(self, candidate: Candidate) -> Bool[Array, " k"]:
@@ -191,7 +192,7 @@ class Bench:
         return _look(self.predict, shots, fit.z, fit.delta, self.step)
 
 
-@partial(jax.jit, static_argnames=("predict", "step"))
+@partial(jax.jit, static_argnames=("predict", "step"), compiler_options=COMPILER_OPTIONS)
 def _look(predict: Any, shots: Shots, x: Array, delta: Array, step: float) -> tuple[Array, Array]:
     def states(_: Array, delta: Array, tried: Tried) -> Array:
         return predict(x, delta, tried)

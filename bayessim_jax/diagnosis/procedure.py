@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import jax
@@ -10,12 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from bayessim_jax.diagnosis.bench import Bench, Candidate
+from bayessim_jax.beliefs.margins import Margins
+from bayessim_jax.diagnosis.bench import SLOTS, Bench, Candidate
 from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, Misfit, judge_misfit
+from bayessim_jax.effects import Scales, at
 from bayessim_jax.inference.direct import noise_floor
-from bayessim_jax.inference.shooting import Fit
+from bayessim_jax.inference.shooting import Fit, Shots
+from bayessim_jax.systems.mjcf import MjcfSystem
 
-__all__ = ["CONTAINS", "Diagnosis", "Entry", "Thresholds", "diagnose", "enter", "share_left"]
+__all__ = ["CONTAINS", "Diagnosis", "Entry", "Problem", "Thresholds", "diagnose", "enter", "share_left"]
 
 CONTAINS = {
     "stribeck_friction": ("coulomb_friction",),
@@ -27,6 +31,12 @@ CONTAINS = {
     "payload": ("link_offset",),
 }
 """Effects that have others as special cases: where both do as well, the simpler one is the finding."""
+
+
+SCREENED, STEPS = 16, 5
+"""Windows and solver steps with which every candidate is tried at first."""
+FINALISTS, LEADERS, PAIRS = 10, 3, 4
+"""Effects that are fitted to the end, those of them whose relatives are too, and pairs."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +77,8 @@ class Diagnosis:
     """What was found."""
 
     verdict: str
+    bench: Bench
+    """On which the candidates that came to the end were fitted."""
     baseline: Entry
     entries: list[Entry]
     """Candidates that came to the end, best first."""
@@ -125,111 +137,165 @@ class _Work:
         return float(-0.5 * (counts * np.log(variance)).sum())
 
 
+@dataclass(frozen=True)
+class Problem:
+    """What a diagnosis is about: a system, what is believed of it, what may be missing, and windows of recordings."""
+
+    system: MjcfSystem
+    margins: Margins
+    pairs: tuple[tuple[Any, str], ...]
+    """Effects and places."""
+    scales: Mapping[str, Scales]
+    shots: Shots
+    group: Int[np.ndarray, " windows"]
+    """The recording of each window."""
+    chosen: Bool[np.ndarray, " windows"]
+    """Windows that choose; the others are never looked at."""
+    step: float = 0.0
+
+    def bench(self, pairs: Sequence[tuple[Any, str]], which: Any = slice(None), slots: int = SLOTS) -> Bench:
+        """A bench for some of the pairs, with some of the windows."""
+        shots = dataclasses.replace(
+            self.shots,
+            inputs=jax.tree.map(lambda x: x[which], self.shots.inputs),
+            y=self.shots.y[which],
+            measured=self.shots.measured[which],
+        )
+        return Bench(self.system, self.margins, pairs, self.scales, shots, self.step, slots)
+
+
 def diagnose(
     key: PRNGKeyArray,
-    bench: Bench,
+    problem: Problem,
     baseline: Fit,
-    group: Int[np.ndarray, " windows"],
-    chosen: Bool[np.ndarray, " windows"],
     *,
     thresholds: Thresholds | None = None,
-    finalists: int = 8,
+    finalists: int = FINALISTS,
     folds: int = 4,
     pairs: bool = True,
     say: Callable[[str], None] = lambda text: None,
 ) -> Diagnosis:
-    """Find what a simulator lacks.
+    """Find what a simulator lacks; `baseline` is its fit without effects to the problem's windows.
 
-    `baseline` is the fit without effects to the bench's windows, `group` the recording of each window, `chosen` the
-    windows that choose; the others are never looked at here.
+    First the simulator as it is; then every effect at every place, a few steps each on a part of the windows, on one
+    bench that holds them all; then the best of them on a bench of their own, to the end.
     """
     thresholds = thresholds or Thresholds()
-    work = _Work(key, bench, group, chosen, noise_floor(bench.shots), say)
-    nothing = Candidate()
+    chosen, nothing = problem.chosen, Candidate()
+    bench = problem.bench(())
+    work = _Work(key, bench, problem.group, chosen, noise_floor(bench.shots), say)
     x = bench.starts(nothing, baseline.z)[0]
     start = bench.fit(nothing, x, baseline.delta, baseline.sigma, work.mask(chosen), steps=8)
     start = work.settle(nothing, start, chosen)
     none = _enter(work, nothing, start, folds)
-    say(f"baseline: p = {none.misfit.p_value:.3f} for no mismatch")
-    if none.misfit.p_value >= FALSE_ALARMS or not bench.pairs:
-        return Diagnosis("no_mismatch", none, [])
-    singles = [Candidate((k,)) for k in range(len(bench.pairs)) if bench.fits(Candidate((k,)))]
-    screened = _screen(work, singles, start)
-    entries = _finish(work, screened[:finalists], folds)
+    say(f"no mismatch has p = {none.misfit.p_value:.3f}")
+    if none.misfit.p_value >= FALSE_ALARMS or not problem.pairs:
+        return Diagnosis("no_mismatch", bench, none, [])
+    say(f"trying {len(problem.pairs)} candidates; compiling takes a while")
+    ranked = _screen(problem, start, say)
+    kept = _with_relatives(problem, [k for k, _ in ranked], finalists)
+    bench = problem.bench(kept)
+    work = _Work(key, bench, problem.group, chosen, noise_floor(bench.shots), say)
+    entries = _finish(work, start, [Candidate((k,)) for k in range(len(kept))], folds)
     if pairs and entries and share_left(entries[0], none) > thresholds.left:
-        entries = _extend(work, entries, [c for c, _, _ in screened], folds, finalists)
-    listed = [("+".join(bench.names(c)), gain) for c, _, gain in screened]
+        entries = _extend(work, entries, folds)
+    listed = [(f"{problem.pairs[k][0].name}@{at(problem.pairs[k][1])}", gain) for k, gain in ranked]
     return _decide(work, none, entries, listed, thresholds)
 
 
-def _screen(work: _Work, candidates: Sequence[Candidate], start: Fit) -> list[tuple[Candidate, Fit, float]]:
-    """Fit every candidate to the windows that choose, best first, with what each gains in log likelihood."""
-    bench, mask = work.bench, work.mask(work.chosen)
-    before = work.likelihood(Candidate(), start, work.chosen)
+def _with_relatives(problem: Problem, ranked: Sequence[int], finalists: int) -> list[tuple[Any, str]]:
+    """The best pairs, and beside each of the first few what has it as a special case, or is one of it."""
+    kept = list(ranked[:finalists])
+    for k in ranked[:LEADERS]:
+        effect, place = problem.pairs[k]
+        for other in ranked[finalists:]:
+            relative, where = problem.pairs[other]
+            kin = effect.name in CONTAINS.get(relative.name, ()) or relative.name in CONTAINS.get(effect.name, ())
+            if kin and where == place and other not in kept:
+                kept.append(other)
+    return [problem.pairs[k] for k in kept]
+
+
+def _screen(problem: Problem, start: Fit, say: Callable[[str], None]) -> list[tuple[int, float]]:
+    """Every pair and what it lowers the cost by in a few steps, the best first."""
+    rows = np.flatnonzero(problem.chosen)
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, SCREENED).astype(int))]
+    bench = problem.bench(problem.pairs, rows)
+    delta, mask = start.delta[rows], bench.shots.measured
+    nothing = Candidate()
+    before = bench.fit(nothing, bench.starts(nothing, start.z[: bench.d])[0], delta, start.sigma, mask, steps=3)
     found = []
-    for number, candidate in enumerate(candidates):
-        best = None
-        for x in bench.starts(candidate, start.z[: bench.d]):
-            fit = bench.fit(candidate, x, start.delta, start.sigma, mask)
-            if np.isfinite(float(fit.cost)) and (best is None or float(fit.cost) < float(best.cost)):
-                best = fit
-        if best is not None:
-            best = work.settle(candidate, best, work.chosen, rounds=1, steps=6)
-            found.append((candidate, best, work.likelihood(candidate, best, work.chosen) - before))
-        if number % 10 == 9:
-            work.say(f"tried {number + 1} of {len(candidates)} candidates")
-    return sorted(found, key=lambda entry: -entry[2] + len(bench.columns(entry[0])))
+    for k in range(len(bench.pairs)):
+        candidate = Candidate((k,))
+        if not bench.fits(candidate):
+            continue
+        costs = [
+            float(bench.fit(candidate, x, before.delta, start.sigma, mask, steps=STEPS).cost)
+            for x in bench.starts(candidate, start.z[: bench.d])
+        ]
+        costs = [cost for cost in costs if np.isfinite(cost)]
+        if costs:
+            found.append((k, float(before.cost) - min(costs)))
+        if k % 20 == 19:
+            say(f"tried {k + 1} of {len(bench.pairs)}")
+    return sorted(found, key=lambda item: -item[1])
 
 
-def _finish(work: _Work, screened: Sequence[tuple[Candidate, Fit, float]], folds: int) -> list[Entry]:
-    """Finalists, fitted to the end and scored across recordings, best first."""
+def _fit(work: _Work, candidate: Candidate, start: Fit, known: Fit | None = None, own: Candidate | None = None) -> Any:
+    """The best fit from a candidate's starts, with `known` values for the effects of `own`."""
+    bench, mask, best = work.bench, work.mask(work.chosen), None
+    for x in bench.starts(candidate, start.z[: bench.d]):
+        if known is not None and own is not None:
+            columns = bench.columns(candidate)
+            for j, column in enumerate(bench.columns(own)):
+                x = x.at[bench.d + columns.index(column)].set(known.z[bench.d + j])
+        fit = bench.fit(candidate, x, start.delta, start.sigma, mask, steps=12)
+        if np.isfinite(float(fit.cost)) and (best is None or float(fit.cost) < float(best.cost)):
+            best = fit
+    return best
+
+
+def _finish(work: _Work, start: Fit, candidates: Sequence[Candidate], folds: int) -> list[Entry]:
+    """Candidates, fitted to the end and scored across recordings, best first."""
     entries = []
-    for candidate, fit, _ in screened:
-        entries.append(_enter(work, candidate, work.settle(candidate, fit, work.chosen), folds))
-        work.say(f"{' + '.join(entries[-1].names)}: log score {entries[-1].score:.1f}")
+    for candidate in candidates:
+        fit = _fit(work, candidate, start)
+        if fit is not None:
+            entries.append(_enter(work, candidate, work.settle(candidate, fit, work.chosen), folds))
+            work.say(f"{' + '.join(entries[-1].names)}: score {entries[-1].score:.1f}")
     return sorted(entries, key=lambda entry: -entry.score)
 
 
-def _extend(work: _Work, entries: list[Entry], singles: Sequence[Candidate], folds: int, finalists: int) -> list[Entry]:
-    """Pairs of the best effects with every other one."""
-    bench, mask, found = work.bench, work.mask(work.chosen), []
-    seen = set()
+def _extend(work: _Work, entries: list[Entry], folds: int) -> list[Entry]:
+    """Pairs of the best effects with every other one on the bench."""
+    bench, found, seen = work.bench, [], set()
     for entry in entries[:2]:
-        for other in singles:
-            pair = entry.candidate + other
+        for k in range(len(bench.pairs)):
+            pair = entry.candidate + Candidate((k,))
             if pair in seen or len(pair.effects) < 2 or not bench.fits(pair):
                 continue
             seen.add(pair)
-            best = None
-            for x in bench.starts(pair, entry.fit.z[: bench.d]):
-                columns, own = bench.columns(pair), bench.columns(entry.candidate)
-                for j, column in enumerate(own):
-                    x = x.at[bench.d + columns.index(column)].set(entry.fit.z[bench.d + j])
-                fit = bench.fit(pair, x, entry.fit.delta, entry.fit.sigma, mask, steps=8)
-                if np.isfinite(float(fit.cost)) and (best is None or float(fit.cost) < float(best.cost)):
-                    best = fit
-            if best is not None:
-                best = work.settle(pair, best, work.chosen, rounds=1, steps=6)
-                found.append((pair, best, work.likelihood(pair, best, work.chosen)))
+            fit = _fit(work, pair, entry.fit, entry.fit, entry.candidate)
+            if fit is not None:
+                fit = work.settle(pair, fit, work.chosen, rounds=1, steps=6)
+                found.append((pair, fit, work.likelihood(pair, fit, work.chosen)))
     work.say(f"tried {len(found)} pairs")
     found.sort(key=lambda item: -item[2] + len(bench.columns(item[0])))
-    return sorted(entries + _finish(work, found[: finalists // 2], folds), key=lambda entry: -entry.score)
+    for pair, fit, _ in found[:PAIRS]:
+        entries.append(_enter(work, pair, work.settle(pair, fit, work.chosen), folds))
+        work.say(f"{' + '.join(entries[-1].names)}: score {entries[-1].score:.1f}")
+    return sorted(entries, key=lambda entry: -entry.score)
 
 
 def enter(
-    key: PRNGKeyArray,
-    bench: Bench,
-    candidate: Candidate,
-    baseline: Fit,
-    group: Int[np.ndarray, " windows"],
-    chosen: Bool[np.ndarray, " windows"],
-    d: int,
+    key: PRNGKeyArray, problem: Problem, bench: Bench, candidate: Candidate, start: Fit, folds: int = 2
 ) -> Entry:
     """Fit one candidate of another bench from a baseline's fit, and score it as all candidates are."""
-    work = _Work(key, bench, group, chosen, noise_floor(bench.shots), lambda text: None)
-    x = bench.starts(Candidate(), baseline.z[:d])[0]
-    fit = bench.fit(candidate, x, baseline.delta, baseline.sigma, work.mask(chosen), steps=10)
-    return _enter(work, candidate, work.settle(candidate, fit, chosen, rounds=3, steps=8), 2)
+    chosen = problem.chosen
+    work = _Work(key, bench, problem.group, chosen, noise_floor(bench.shots), lambda text: None)
+    x = bench.starts(Candidate(), start.z[: bench.d])[0]
+    fit = bench.fit(candidate, x, start.delta, start.sigma, work.mask(chosen), steps=10)
+    return _enter(work, candidate, work.settle(candidate, fit, chosen, rounds=3, steps=8), folds)
 
 
 def _enter(work: _Work, candidate: Candidate, fit: Fit, folds: int) -> Entry:
@@ -276,7 +342,7 @@ def _decide(
     work: _Work, none: Entry, entries: list[Entry], screened: list[tuple[str, float]], thresholds: Thresholds
 ) -> Diagnosis:
     """One of four verdicts."""
-    result = Diagnosis("unexplained", none, entries, [], screened)
+    result = Diagnosis("unexplained", work.bench, none, entries, [], screened)
     if not entries:
         return result
     best = entries[0]

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from bayessim_jax.diagnosis.bench import Bench, Candidate
 from bayessim_jax.diagnosis.flexible import FEATURES, FlexibleForce, features
 from bayessim_jax.diagnosis.locate import Location, find_regime, find_windows_of, shares_from_left
-from bayessim_jax.diagnosis.procedure import Diagnosis, Entry, Thresholds, diagnose, enter, share_left
+from bayessim_jax.diagnosis.procedure import Diagnosis, Entry, Problem, Thresholds, diagnose, enter, share_left
 from bayessim_jax.diagnosis.scales import find_scales
 from bayessim_jax.effects import EFFECTS, effect_places
 from bayessim_jax.inference.scores import Score, compare, error_spread, score
@@ -24,7 +24,7 @@ from bayessim_jax.recordings.identification import channel_scale, settle_step, s
 from bayessim_jax.recordings.shots import CaseModel, split_windows, take
 from bayessim_jax.recordings.windows import Windows
 
-__all__ = ["CaseDiagnosis", "case_bench", "diagnose_case"]
+__all__ = ["CaseDiagnosis", "case_problem", "diagnose_case"]
 
 MOST_FITTED, MOST_HELD = 44, 20
 """Windows that choose and windows that judge; of longer recordings they are spread evenly."""
@@ -156,29 +156,33 @@ def _thin(windows: Windows, most: int) -> Windows:
     return windows if count <= most else take(windows, np.unique(np.linspace(0, count - 1, most).astype(int)))
 
 
-def case_bench(
+def case_problem(
     key: Array, model: CaseModel, *, say: Callable[[str], None] = lambda text: None
-) -> tuple[CaseModel, Bench, Windows, np.ndarray, Fit]:
-    """The bench of a case with every registered effect at every place; the windows that choose come first."""
+) -> tuple[CaseModel, Problem, Windows, Fit]:
+    """A case as the diagnosis takes it, with every registered effect at every place, and the fit without effects.
+
+    The windows that choose come first.
+    """
     fitted, held = split_windows(model)
     fitted, held = _thin(fitted, MOST_FITTED), _thin(held, MOST_HELD)
     model, fit = settle_step(key, model, fitted, say=say)
     windows = join(fitted, held)
-    chosen = np.arange(len(windows)) < len(fitted)
     system = model.system
-    pairs = [(effect, place) for effect in EFFECTS.values() for place in effect_places(effect, system)]
+    pairs = tuple((effect, place) for effect in EFFECTS.values() for place in effect_places(effect, system))
     motions = [(r.time, r.qpos, r.qvel, r.ctrl) for r in model.recordings]
     joints = [f"joint/{name}" for name, *_ in model.case.layout.joints]
-    scales = find_scales(system.engine.model, motions, [*(p for _, p in pairs), *joints], system.dt)
-    bench = Bench(system, model.margins, pairs, scales, model.shots(windows), model.step)
-    start = jnp.concatenate([fit.delta, jnp.zeros((len(held), fit.delta.shape[1]))])
-    return (
-        model,
-        bench,
-        windows,
-        chosen,
-        Fit(fit.z, start, fit.sigma, fit.precision, fit.cost, fit.steps, fit.converged),
+    problem = Problem(
+        system=system,
+        margins=model.margins,
+        pairs=pairs,
+        scales=find_scales(system.engine.model, motions, [*(p for _, p in pairs), *joints], system.dt),
+        shots=model.shots(windows),
+        group=windows.recording,
+        chosen=np.arange(len(windows)) < len(fitted),
+        step=model.step,
     )
+    delta = jnp.concatenate([fit.delta, jnp.zeros((len(held), fit.delta.shape[1]))])
+    return model, problem, windows, dataclasses.replace(fit, delta=delta)
 
 
 def join(first: Windows, second: Windows) -> Windows:
@@ -203,13 +207,15 @@ def diagnose_case(
     """Diagnose a case; raises `ValueError` where nothing can be simulated."""
     fit_key, key = jax.random.split(key)
     say("fitting the simulator as it is")
-    model, bench, windows, chosen, baseline = case_bench(fit_key, model, say=say)
-    say(f"{len(bench.pairs)} candidates, {int(chosen.sum())} windows that choose, {int((~chosen).sum())} that judge")
-    result = diagnose(key, bench, baseline, windows.recording, chosen, thresholds=thresholds, say=say)
+    model, problem, windows, baseline = case_problem(fit_key, model, say=say)
+    chosen = problem.chosen
+    say(f"{int(chosen.sum())} windows choose, {int((~chosen).sum())} judge")
+    result = diagnose(key, problem, baseline, thresholds=thresholds, say=say)
+    bench = result.bench
     flexible, bench_flexible, places, shares, forces = None, None, [], np.zeros(0), {}
     if result.verdict != "no_mismatch":
         say("fitting a residual force without a name")
-        flexible, bench_flexible, places, shares, forces = _flexible(key, model, bench, windows, chosen, result)
+        flexible, bench_flexible, places, shares, forces = _flexible(key, model, problem, windows, result)
     scale = channel_scale(bench.shots)
     entries = {"baseline": result.baseline, "augmented": result.best}
     predictions = {name: _restarted(bench, entry) for name, entry in entries.items()}
@@ -268,24 +274,21 @@ def _floor(bench: Bench, entry: Entry, scale: np.ndarray, model: CaseModel, chos
 
 
 def _flexible(
-    key: Array, model: CaseModel, bench: Bench, windows: Windows, chosen: np.ndarray, result: Diagnosis
+    key: Array, model: CaseModel, problem: Problem, windows: Windows, result: Diagnosis
 ) -> tuple[Entry, Bench, list[str], np.ndarray, dict[str, tuple[np.ndarray, ...]]]:
     """A flexible force at all joints, what each joint alone explains, and the forces along the recordings."""
     joints = [(name, q, v) for name, kind, q, v in model.case.layout.joints if kind in (2, 3)]
     places = [f"joint/{name}" for name, _, _ in joints]
-    scales = {p: bench.scales[p] for p in places}
+    scales, chosen = {p: problem.scales[p] for p in places}, problem.chosen
     pairs = [(FlexibleForce(p, scales[p]), p) for p in places]
-    flexible = Bench(model.system, model.margins, pairs, scales, bench.shots, model.step, slots=FEATURES * len(places))
-    every = Candidate(tuple(range(len(pairs))))
-    base = result.baseline.fit
-    entry = enter(key, flexible, every, base, windows.recording, chosen, bench.d)
+    bench = problem.bench(pairs, slots=FEATURES * len(places))
+    start = result.baseline.fit
+    entry = enter(key, problem, bench, Candidate(tuple(range(len(pairs)))), start)
     left = [share_left(entry, result.baseline)]
     if len(places) > 1:
-        alone = [
-            enter(key, flexible, Candidate((k,)), base, windows.recording, chosen, bench.d) for k in range(len(places))
-        ]
+        alone = [enter(key, problem, bench, Candidate((k,)), start, 1) for k in range(len(places))]
         left = [share_left(e, result.baseline) for e in alone]
-    weights = np.asarray(jnp.stack([flexible.each[0].value(z) for z in entry.fit.z[bench.d :]]))
+    weights = np.asarray(jnp.stack([bench.each[0].value(z) for z in entry.fit.z[bench.d :]]))
     forces = {}
     gears = _gears(model)
     rows = np.concatenate([np.zeros((len(windows), 0), bool), windows.valid], axis=1) & chosen[:, None]
@@ -298,7 +301,7 @@ def _flexible(
         own = weights[k * FEATURES : (k + 1) * FEATURES]
         time = (windows.start[:, None] + windows.time[:, :-1])[rows]
         forces[place] = (scales[place].force * (own @ phi), position, velocity, drive, time)
-    return entry, flexible, places, shares_from_left(left), forces
+    return entry, bench, places, shares_from_left(left), forces
 
 
 def _gears(model: CaseModel) -> Float[np.ndarray, "nu nv"]:
