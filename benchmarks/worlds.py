@@ -92,8 +92,8 @@ RIGS = {
             '<motor name="m1" joint="shoulder" gear="1"/><motor name="m2" joint="elbow" gear="1"/>',
         ),
         (("upper_mass", "body/upper/mass", 0.4, 0.9, "kg"), ("lower_mass", "body/lower/mass", 0.25, 0.6, "kg")),
-        drive=(2.0, 0.8),
-        swing=0.8,
+        drive=(1.5, 0.25),
+        swing=0.5,
     ),
     "cart": Rig(
         "cart",

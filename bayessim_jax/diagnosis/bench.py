@@ -20,13 +20,15 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from bayessim_jax.beliefs.margins import Margin, Margins, log_uniform, uniform
-from bayessim_jax.effects import Scales, at, with_effects
+from bayessim_jax.effects import EffectParameter, Scales, at, with_effects
 from bayessim_jax.inference.replay import Inputs, replay_window
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Fit, Shots, expand, solve
 from bayessim_jax.systems.mjcf import MjcfSystem
 
 __all__ = ["Bench", "Candidate", "Trial"]
 
+NEAR = 0.1
+"""Of the way from an effect's neutral value to where a fit usually begins: weak effects are found from there."""
 SLOTS = 6
 """Parameters that a candidate may have beside θ."""
 
@@ -137,8 +139,9 @@ class Bench:
         begin = np.array([float(self.each[i].standard(jnp.asarray(self.parameters[i].start, float))) for i in columns])
         rest = np.zeros(self.slots - len(columns))
         signed = any(self.parameters[i].low < 0.0 for i in columns)
-        both = [begin, -begin] if signed else [begin]
-        return [jnp.concatenate([z, jnp.asarray(x), jnp.asarray(rest)]) for x in both]
+        every = [near, begin, -begin] if signed else [near, begin]
+        every = every if len(columns) and np.abs(near - begin).max() > 1e-9 else every[1:]
+        return [jnp.concatenate([z, jnp.asarray(x), jnp.asarray(rest)]) for x in every]
 
     def free(self, candidate: Candidate) -> Bool[Array, " k"]:
         """Which of the numbers that a fit finds are free."""
@@ -190,6 +193,11 @@ class Bench:
         """Residuals in the channels' units, and the derivatives of predictions along the initial states over S."""
         shots = self.setup(candidate, measured)
         return _look(self.predict, shots, fit.z, fit.delta, self.step)
+
+
+def _moves(p: EffectParameter) -> bool:
+    """Whether an effect grows from its neutral value along a parameter."""
+    return np.isfinite(p.neutral) and p.low <= p.neutral <= p.high and not p.log
 
 
 @partial(jax.jit, static_argnames=("predict", "step"), compiler_options=COMPILER_OPTIONS)

@@ -35,6 +35,8 @@ CONTAINS = {
 
 SCREENED, STEPS = 16, 5
 """Windows and solver steps with which every candidate is tried at first."""
+HEAVY = frozenset({"sensor_delay", "hysteresis"})
+"""Effects that cost several times what the others do: they are tried on a bench of their own."""
 FINALISTS, LEADERS, PAIRS = 10, 3, 4
 """Effects that are fitted to the end, those of them whose relatives are too, and pairs."""
 
@@ -220,24 +222,27 @@ def _screen(problem: Problem, start: Fit, say: Callable[[str], None]) -> list[tu
     """Every pair and what it lowers the cost by in a few steps, the best first."""
     rows = np.flatnonzero(problem.chosen)
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, SCREENED).astype(int))]
-    bench = problem.bench(problem.pairs, rows)
-    delta, mask = start.delta[rows], bench.shots.measured
-    nothing = Candidate()
-    before = bench.fit(nothing, bench.starts(nothing, start.z[: bench.d])[0], delta, start.sigma, mask, steps=3)
-    found = []
-    for k in range(len(bench.pairs)):
-        candidate = Candidate((k,))
-        if not bench.fits(candidate):
+    nothing, found = Candidate(), []
+    for heavy in (False, True):
+        numbers = [k for k, (effect, _) in enumerate(problem.pairs) if (effect.name in HEAVY) == heavy]
+        if not numbers:
             continue
-        costs = [
-            float(bench.fit(candidate, x, before.delta, start.sigma, mask, steps=STEPS).cost)
-            for x in bench.starts(candidate, start.z[: bench.d])
-        ]
-        costs = [cost for cost in costs if np.isfinite(cost)]
-        if costs:
-            found.append((k, float(before.cost) - min(costs)))
-        if k % 20 == 19:
-            say(f"tried {k + 1} of {len(bench.pairs)}")
+        bench = problem.bench([problem.pairs[k] for k in numbers], rows)
+        delta, mask = start.delta[rows], bench.shots.measured
+        before = bench.fit(nothing, bench.starts(nothing, start.z[: bench.d])[0], delta, start.sigma, mask, steps=3)
+        for i, k in enumerate(numbers):
+            candidate = Candidate((i,))
+            if not bench.fits(candidate):
+                continue
+            costs = [
+                float(bench.fit(candidate, x, before.delta, start.sigma, mask, steps=STEPS).cost)
+                for x in bench.starts(candidate, start.z[: bench.d])
+            ]
+            costs = [cost for cost in costs if np.isfinite(cost)]
+            if costs:
+                found.append((k, float(before.cost) - min(costs)))
+            if i % 20 == 19:
+                say(f"tried {i + 1} of {len(numbers)}")
     return sorted(found, key=lambda item: -item[1])
 
 

@@ -12,6 +12,7 @@ from bayessim_jax.effects.contract import Scales as Scales
 from bayessim_jax.effects.contract import SenseEffect as SenseEffect
 from bayessim_jax.effects.mjcf_edits import write_mjcf as write_mjcf
 from bayessim_jax.effects.places import at as at
+from bayessim_jax.effects.places import joints as joints
 from bayessim_jax.effects.registry import EFFECTS as EFFECTS
 from bayessim_jax.effects.registry import lookup_effect as lookup_effect
 from bayessim_jax.effects.registry import register_effect as register_effect
