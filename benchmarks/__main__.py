@@ -1,4 +1,5 @@
-"""Benchmarks against other projects: `python -m benchmarks online | estimator | scaling | engines`."""
+"""Benchmarks against other projects: `python -m benchmarks online | estimator | scaling | engines |
+concealed`."""
 
 from __future__ import annotations
 
@@ -46,10 +47,21 @@ def main() -> None:
     engines.add_argument("--repeats", type=int, default=5)
     engines.add_argument("--mjx", type=int, default=1024, metavar="BATCH", help="batch of MJX; 0 leaves it out")
 
+    concealed = commands.add_parser("concealed", help="diagnoses of made-up machines with an effect concealed in them")
+    concealed.add_argument("--rigs", nargs="+", default=["pendulum", "slide", "swing", "cart", "double"])
+    concealed.add_argument("--cases", type=int, default=200)
+    concealed.add_argument("--seed", type=int, default=1)
+    concealed.add_argument("--out", type=Path, help="file of JSON lines to append cases to, and to resume from")
+
     for command in (online, estimator, scaling, engines):
         command.add_argument("--clock", choices=CLOCKS, default="wall", help="cpu: seconds summed over threads")
 
     options = parser.parse_args()
+    if options.command == "concealed":
+        from benchmarks.concealed import diagnose_concealed
+
+        diagnose_concealed(options)
+        return
     choose_clock(options.clock)
     if options.command == "online":
         from benchmarks.online import compare_rounds

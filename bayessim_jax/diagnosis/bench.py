@@ -134,14 +134,20 @@ class Bench:
         return dataclasses.replace(self.shots, inputs=inputs, measured=mask)
 
     def starts(self, candidate: Candidate, z: Float[Array, " d"]) -> list[Float[Array, " k"]]:
-        """Points to begin from: θ as given, the effects at their start values, and mirrored in their ranges."""
+        """Points to begin from: θ as given, and the effects a little off neutral, at their start values, and mirrored."""
         columns = self.columns(candidate)
-        begin = np.array([float(self.each[i].standard(jnp.asarray(self.parameters[i].start, float))) for i in columns])
+        own = [self.parameters[i] for i in columns]
+
+        def standard(values: Sequence[float]) -> np.ndarray:
+            pairs = zip(columns, values, strict=True)
+            return np.array([float(self.each[i].standard(jnp.asarray(v, float))) for i, v in pairs])
+
+        begin = standard([p.start for p in own])
+        near = standard([p.neutral + NEAR * (p.start - p.neutral) if _moves(p) else p.start for p in own])
+        points = [near, begin] if len(own) and np.abs(near - begin).max() > 1e-9 else [begin]
+        points += [-begin] if any(p.low < 0.0 for p in own) else []
         rest = np.zeros(self.slots - len(columns))
-        signed = any(self.parameters[i].low < 0.0 for i in columns)
-        every = [near, begin, -begin] if signed else [near, begin]
-        every = every if len(columns) and np.abs(near - begin).max() > 1e-9 else every[1:]
-        return [jnp.concatenate([z, jnp.asarray(x), jnp.asarray(rest)]) for x in every]
+        return [jnp.concatenate([z, jnp.asarray(x), jnp.asarray(rest)]) for x in points]
 
     def free(self, candidate: Candidate) -> Bool[Array, " k"]:
         """Which of the numbers that a fit finds are free."""

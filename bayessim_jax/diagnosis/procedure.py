@@ -292,9 +292,7 @@ def _extend(work: _Work, entries: list[Entry], folds: int) -> list[Entry]:
     return sorted(entries, key=lambda entry: -entry.score)
 
 
-def enter(
-    key: PRNGKeyArray, problem: Problem, bench: Bench, candidate: Candidate, start: Fit, folds: int = 2
-) -> Entry:
+def enter(key: PRNGKeyArray, problem: Problem, bench: Bench, candidate: Candidate, start: Fit, folds: int = 2) -> Entry:
     """Fit one candidate of another bench from a baseline's fit, and score it as all candidates are."""
     chosen = problem.chosen
     work = _Work(key, bench, problem.group, chosen, noise_floor(bench.shots), lambda text: None)

@@ -25,7 +25,19 @@ from jaxtyping import Array, Bool, Float, Int
 
 from bayessim_jax.contracts import Scalar
 
-__all__ = ["COMPILER_OPTIONS", "Curvature", "Fit", "Predict", "Shots", "linearize", "Ridge", "profile", "residuals", "ridge", "solve"]
+__all__ = [
+    "COMPILER_OPTIONS",
+    "Curvature",
+    "Fit",
+    "Predict",
+    "Shots",
+    "linearize",
+    "Ridge",
+    "profile",
+    "residuals",
+    "ridge",
+    "solve",
+]
 
 Predict = Callable[[Float[Array, " d"], Float[Array, " n"], Any], Float[Array, "rows obs"]]
 """`predict(z, δ, window)`: what the sensors show of one window, in every row."""

@@ -16,8 +16,7 @@ from bayessim_jax.diagnosis.bench import Bench, Candidate
 from bayessim_jax.diagnosis.flexible import FEATURES, FlexibleForce, features
 from bayessim_jax.diagnosis.locate import Location, find_regime, find_windows_of, shares_from_left
 from bayessim_jax.diagnosis.procedure import Diagnosis, Entry, Problem, Thresholds, diagnose, enter, share_left
-from bayessim_jax.diagnosis.scales import find_scales
-from bayessim_jax.effects import EFFECTS, effect_places
+from bayessim_jax.effects import EFFECTS, Scales, effect_places, recorded_scales
 from bayessim_jax.inference.scores import Score, compare, error_spread, score
 from bayessim_jax.inference.shooting import Fit
 from bayessim_jax.recordings.identification import channel_scale, settle_step, start_spread
@@ -54,6 +53,11 @@ class CaseDiagnosis:
     """Mean and standard deviation of the parameters, `baseline` and `augmented`."""
     probabilities: list[float]
     next_experiment: str
+
+    @property
+    def shares_left(self) -> list[float]:
+        """Share of the misfit that every finalist leaves."""
+        return [share_left(entry, self.result.baseline) for entry in self.result.entries]
 
     @property
     def held_out(self) -> list[str]:
@@ -169,13 +173,12 @@ def case_problem(
     windows = join(fitted, held)
     system = model.system
     pairs = tuple((effect, place) for effect in EFFECTS.values() for place in effect_places(effect, system))
-    motions = [(r.time, r.qpos, r.qvel, r.ctrl) for r in model.recordings]
-    joints = [f"joint/{name}" for name, *_ in model.case.layout.joints]
+    joints = [f"joint/{name}" for name, kind, *_ in model.case.layout.joints if kind in (2, 3)]
     problem = Problem(
         system=system,
         margins=model.margins,
         pairs=pairs,
-        scales=find_scales(system.engine.model, motions, [*(p for _, p in pairs), *joints], system.dt),
+        scales=_scales(model, [*(place for _, place in pairs), *joints]),
         shots=model.shots(windows),
         group=windows.recording,
         chosen=np.arange(len(windows)) < len(fitted),
@@ -183,6 +186,14 @@ def case_problem(
     )
     delta = jnp.concatenate([fit.delta, jnp.zeros((len(held), fit.delta.shape[1]))])
     return model, problem, windows, dataclasses.replace(fit, delta=delta)
+
+
+def _scales(model: CaseModel, places: Sequence[str]) -> dict[str, Scales]:
+    """How large things are at every place, over all recordings."""
+    qpos, qvel, ctrl = (np.concatenate([getattr(r, n) for r in model.recordings]) for n in ("qpos", "qvel", "ctrl"))
+    duration = max(float(r.time[-1] - r.time[0]) for r in model.recordings)
+    m, dt = model.system.engine.model, model.system.dt
+    return {place: recorded_scales(m, place, qpos, qvel, ctrl, dt, duration) for place in dict.fromkeys(places)}
 
 
 def join(first: Windows, second: Windows) -> Windows:
@@ -339,19 +350,13 @@ def _locations(
     for k in np.argsort(-shares):
         place = places[k]
         force, position, velocity, drive, time = forces[place]
-        scales = _scales_of(model, place, forces)
-        regime = find_regime(force, position, velocity, drive, time, scales)
+        regime = find_regime(force, position, velocity, drive, time, result.bench.scales[place])
         if shares[k] >= 0.02 or not found:
             found.append(Location(named.get(place, place), float(shares[k]), regime, when))
     total = sum(place.share for place in found)
     for place in found:
         place.share = round(place.share / total, 4)
     return sorted(found, key=lambda place: (place.at not in named.values(), -place.share))
-
-
-def _scales_of(model: CaseModel, place: str, forces: dict[str, tuple[np.ndarray, ...]]) -> Any:
-    motions = [(r.time, r.qpos, r.qvel, r.ctrl) for r in model.recordings]
-    return find_scales(model.system.engine.model, motions, [place], model.system.dt)[place]
 
 
 def _joint_of(model: CaseModel, place: str) -> str:

@@ -11,6 +11,7 @@ import xarray as xr
 from jaxtyping import Float
 
 from bayessim_jax import __version__
+from bayessim_jax.effects import write_mjcf
 from bayessim_jax.recordings.evaluation import write_state
 from bayessim_jax.recordings.files import replace_file, to_json, write_text
 from bayessim_jax.recordings.loading import LoadedCase, load_case
@@ -19,7 +20,7 @@ from bayessim_jax.recordings.posterior import ENGINE, read_group, variable
 from bayessim_jax.recordings.run_folder import RunFolder
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from bayessim_jax.recordings.diagnosing import CaseDiagnosis
     from bayessim_jax.recordings.identification import CaseInference
@@ -37,9 +38,19 @@ def write_inference(folder: RunFolder, result: CaseInference, seed: int) -> None
     write_model(folder.path / "model_posterior.xml", result.model.case, means)
 
 
-def write_model(path: Path, case: LoadedCase, values: Mapping[str, float]) -> None:
-    """Write a case's model with values put in, and the files that it refers to beside it, so that MuJoCo loads it."""
+def write_model(
+    path: Path,
+    case: LoadedCase,
+    values: Mapping[str, float],
+    effects: Sequence[tuple[Any, str, Mapping[str, float]]] = (),
+) -> bool:
+    """Write a case's model with values and effects put in, and the files that it refers to beside it.
+
+    Nothing is written, and False returned, where MJCF cannot say one of the effects.
+    """
     spec, _ = case.augmented(values)
+    if not all(write_mjcf(spec, effect, place, own) for effect, place, own in effects):
+        return False
     source = case.case.folder / case.case.model
     for file in referenced_files(source, case.case.folder):
         if file.suffix.lower() not in (".xml", ".mjcf"):
@@ -47,6 +58,7 @@ def write_model(path: Path, case: LoadedCase, values: Mapping[str, float]) -> No
             place.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file, place)
     write_text(path, spec.to_xml())
+    return True
 
 
 def write_diagnosis(folder: RunFolder, diagnosis: CaseDiagnosis, seed: int) -> None:
@@ -56,8 +68,21 @@ def write_diagnosis(folder: RunFolder, diagnosis: CaseDiagnosis, seed: int) -> N
     _write_laplace(folder.path / "posterior.nc", diagnosis, seed)
     theta, _ = diagnosis.theta["augmented"]
     values = dict(zip(diagnosis.model.margins.names, theta.tolist(), strict=True))
-    if diagnosis.result.verdict == "no_mismatch":
-        write_model(folder.path / "model_augmented.xml", diagnosis.model.case, values)
+    if diagnosis.result.verdict != "unexplained":
+        effects = _found(diagnosis) if diagnosis.result.confusion else []
+        write_model(folder.path / "model_augmented.xml", diagnosis.model.case, values, effects)
+
+
+def _found(diagnosis: CaseDiagnosis) -> list[tuple[Any, str, dict[str, float]]]:
+    """The effects of a diagnosis with their parameters' means."""
+    bench, entry = diagnosis.bench, diagnosis.result.best
+    values = iter(bench.values(entry.candidate, entry.fit.z).values())
+    found = []
+    for k in entry.candidate.effects:
+        effect, place = bench.pairs[k]
+        names = [p.name for p in bench.parameters[bench.first[k] : bench.first[k + 1]]]
+        found.append((effect, place, {name: next(values) for name in names}))
+    return found
 
 
 def _write_laplace(path: Path, diagnosis: CaseDiagnosis, seed: int) -> None:

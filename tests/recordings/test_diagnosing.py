@@ -1,0 +1,113 @@
+"""Diagnoses of made-up machines with something concealed in them, and of clean ones."""
+
+import json
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from bayessim_jax.cli.main import main
+from benchmarks.worlds import make_case
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("diagnoses")
+
+
+@pytest.fixture(scope="module")
+def friction(folder):
+    make_case(folder / "friction", "pendulum", "coulomb_friction", seed=11, recordings=4, seconds=3.0)
+    assert main(["diagnose", str(folder / "friction"), "--out", str(folder / "friction-run"), "--quiet"]) == 0
+    assert not jax.config.read("jax_enable_x64")
+    return folder / "friction-run", json.loads((folder / "friction-run" / "diagnosis.json").read_text())
+
+
+def test_dry_friction_is_named_with_its_level(friction):
+    _, table = friction
+    assert table["verdict"] == "explained"
+    assert [(e["effect"], e["at"]) for e in table["effects"]] == [("coulomb_friction", "joint/hinge")]
+    coulomb = table["effects"][0]["parameters"]["coulomb"]
+    assert coulomb["unit"] == "N m" and coulomb["mean"] == pytest.approx(0.19, rel=0.1)
+    assert table["misfit"]["p_value"] < 0.05
+    place = table["locations"][0]
+    assert place["at"] == "joint/hinge" and place["share"] == 1.0 and place["windows"]
+    assert sum(p["share"] for p in table["locations"]) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_predictions_of_recordings_left_out_get_as_good_as_noise_allows(friction):
+    _, table = friction
+    fit = table["fit"]
+    assert fit["augmented"]["nrmse"] < 0.2 * fit["baseline"]["nrmse"]
+    assert fit["augmented"]["nrmse"] < 2.5 * fit["noise_floor"]
+    assert fit["augmented"]["log_score"] > fit["baseline"]["log_score"]
+    assert len(fit["held_out"]) == 1
+    mass = table["parameters"]["mass"]
+    assert abs(mass["augmented"]["mean"] - mass["baseline"]["mean"]) > 5 * mass["augmented"]["sd"]
+
+
+def test_the_run_folder_is_complete_and_the_model_has_the_friction(friction):
+    run, table = friction
+    for name in ("posterior.nc", "report.html", "config.toml", "run.json", "simulators.json"):
+        assert (run / name).stat().st_size > 0
+    model = mujoco.MjModel.from_xml_path(str(run / "model_augmented.xml"))
+    wanted = table["effects"][0]["parameters"]["coulomb"]["mean"]
+    assert model.dof_frictionloss[0] == pytest.approx(wanted, rel=1e-4)
+    page = (run / "report.html").read_text()
+    assert "Missing is coulomb_friction at joint/hinge" in page
+
+
+def test_recordings_given_later_are_scored(friction, folder, capsys):
+    run, table = friction
+    held = table["fit"]["held_out"][0]
+    assert main(["evaluate", str(run), "--recordings", str(folder / "friction" / "recordings" / held)]) == 0
+    found = json.loads((run / "evaluation.json").read_text())["fit"]
+    assert found["held_out"] == [held]
+    assert found["baseline"]["nrmse"] == pytest.approx(table["fit"]["baseline"]["nrmse"], rel=0.2)
+    assert found["augmented"]["nrmse"] == pytest.approx(table["fit"]["augmented"]["nrmse"], rel=0.3)
+    assert "augmented" in capsys.readouterr().out
+    assert main(["evaluate", str(run), "--recordings", str(folder / "nothing" / "*.csv")]) == 2
+    assert main(["evaluate", str(folder), "--recordings", "x.csv"]) == 2
+    told = capsys.readouterr().err.strip().splitlines()
+    assert len(told) == 2 and "no file matches" in told[0]
+
+
+@pytest.mark.slow
+def test_a_clean_machine_lacks_nothing(folder):
+    make_case(folder / "clean", "slide", seed=12)
+    assert main(["diagnose", str(folder / "clean"), "--out", str(folder / "clean-run"), "--quiet"]) == 0
+    table = json.loads((folder / "clean-run" / "diagnosis.json").read_text())
+    assert table["verdict"] == "no_mismatch"
+    assert table["effects"] == [] and table["locations"] == [] and table["confusion_set"] == []
+
+
+@pytest.mark.slow
+def test_what_no_candidate_explains_is_refused_and_located(folder):
+    make_case(folder / "beat", "pendulum", "beat", seed=13)
+    assert main(["diagnose", str(folder / "beat"), "--out", str(folder / "beat-run"), "--quiet"]) == 0
+    table = json.loads((folder / "beat-run" / "diagnosis.json").read_text())
+    assert table["verdict"] == "unexplained"
+    assert table["effects"] == [] and table["locations"][0]["at"] == "joint/hinge"
+
+
+def test_white_residuals_have_uniform_p_values():
+    from bayessim_jax.diagnosis.whiteness import judge_misfit
+
+    rng = np.random.default_rng(0)
+    windows, rows = 8, 40
+    slopes = np.stack([np.ones(rows), np.linspace(-1, 1, rows)])[None].repeat(windows, 0)
+    measured = np.ones((windows, rows, 1), bool)
+    p_values = []
+    for trial in range(40):
+        noise = 0.3 * rng.standard_normal((windows, rows))
+        q, _ = np.linalg.qr(slopes[0].T)
+        noise = noise - noise @ q @ q.T
+        found = judge_misfit(jax.random.key(trial), noise[..., None], jax.numpy.asarray(slopes), measured)
+        p_values.append(found.p_value)
+    assert 0.3 < np.mean(p_values) < 0.7
+    assert np.mean(np.array(p_values) < 0.05) < 0.15
+    wave = 0.2 * np.sin(np.linspace(0, 6, rows))
+    smooth = judge_misfit(jax.random.key(0), (noise + wave)[..., None], jax.numpy.asarray(slopes), measured)
+    assert smooth.p_value < 0.01
+    assert smooth.noise[0] == pytest.approx(0.3, rel=0.15)
