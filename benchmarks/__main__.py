@@ -1,5 +1,4 @@
-"""Benchmarks against other projects: `python -m benchmarks online | estimator | scaling | engines |
-concealed`."""
+"""Benchmarks: `python -m benchmarks online | estimator | scaling | engines | concealed`."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ __all__ = ["Diagnose", "diagnose"]
 
 @dataclass(frozen=True)
 class Diagnose:
-    """Compare a simulator with recordings: detect a mismatch, locate it, name the effect that was left out, model it."""
+    """Compare a simulator with recordings: detect a mismatch, locate it, name the effect left out, and model it."""
 
     case: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="CASE")]]
     """The case: a folder with a case.toml."""

@@ -79,7 +79,8 @@ class Bench:
     ) -> None:
         self.margins, self.pairs, self.step, self.slots = margins, tuple(pairs), step, slots
         self.scales = scales
-        self.union = with_effects(system, self.pairs, scales) if self.pairs else system
+        plain: Any = system
+        self.union = with_effects(plain, self.pairs, scales) if self.pairs else plain
         self.channels = tuple(c.name for c in system.channels)
         self.shots = shots
         wired = self.union.effects if self.pairs else ()
@@ -134,7 +135,7 @@ class Bench:
         return dataclasses.replace(self.shots, inputs=inputs, measured=mask)
 
     def starts(self, candidate: Candidate, z: Float[Array, " d"]) -> list[Float[Array, " k"]]:
-        """Points to begin from: θ as given, and the effects a little off neutral, at their start values, and mirrored."""
+        """Points to begin from: θ as given, the effects a little off neutral, at their start values, and mirrored."""
         columns = self.columns(candidate)
         own = [self.parameters[i] for i in columns]
 

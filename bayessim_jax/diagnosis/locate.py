@@ -80,7 +80,7 @@ def find_windows_of(
     """Stretches of time in which the misfit is, windows next to each other joined, the strongest first."""
     if not len(excess) or not excess.max() > 0:
         return []
-    strong = np.flatnonzero(excess > 0.2 * excess.max())
+    strong = np.flatnonzero(excess > 0.2 * excess.max()).tolist()
     stretches: list[list[float | str]] = []
     for w in sorted(strong, key=lambda w: (recording[w], start[w])):
         begin, end = float(start[w]), float(start[w] + length)

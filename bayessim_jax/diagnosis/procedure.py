@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import jax
@@ -19,7 +20,7 @@ from bayessim_jax.inference.direct import noise_floor
 from bayessim_jax.inference.shooting import Fit, Shots
 from bayessim_jax.systems.mjcf import MjcfSystem
 
-__all__ = ["CONTAINS", "Diagnosis", "Entry", "Problem", "Thresholds", "diagnose", "enter", "share_left"]
+__all__ = ["CONTAINS", "Diagnosis", "Entry", "Problem", "Thresholds", "detect", "enter", "name_effects", "share_left"]
 
 CONTAINS = {
     "stribeck_friction": ("coulomb_friction",),
@@ -39,6 +40,8 @@ HEAVY = frozenset({"sensor_delay", "hysteresis"})
 """Effects that cost several times what the others do: they are tried on a bench of their own."""
 FINALISTS, LEADERS, PAIRS = 10, 3, 4
 """Effects that are fitted to the end, those of them whose relatives are too, and pairs."""
+FOLDS = 4
+"""Groups of recordings, each scored by fits to the others."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,7 @@ class Thresholds:
 
     negligible: float = 0.02
     """Share of the baseline's residual variance: what a candidate that removes less is not worth."""
-    left: float = 0.15
+    left: float = 0.05
     """Share of the baseline's misfit that an explanation may leave."""
     tie: float = 2.0
     """Standard errors within which two candidates predict held-out windows alike."""
@@ -166,43 +169,45 @@ class Problem:
         return Bench(self.system, self.margins, pairs, self.scales, shots, self.step, slots)
 
 
-def diagnose(
+def detect(key: PRNGKeyArray, problem: Problem, baseline: Fit, folds: int = FOLDS) -> tuple[Bench, Entry]:
+    """The simulator without effects: fitted, scored across recordings, and tested for a mismatch.
+
+    `baseline` is its fit to the problem's windows, where this begins.
+    """
+    nothing, bench = Candidate(), problem.bench(())
+    work = _Work(key, bench, problem.group, problem.chosen, noise_floor(bench.shots), _quiet)
+    x = bench.starts(nothing, baseline.z)[0]
+    fit = bench.fit(nothing, x, baseline.delta, baseline.sigma, work.mask(problem.chosen), steps=8)
+    return bench, _enter(work, nothing, work.settle(nothing, fit, problem.chosen), folds)
+
+
+def name_effects(
     key: PRNGKeyArray,
     problem: Problem,
-    baseline: Fit,
+    none: Entry,
     *,
     thresholds: Thresholds | None = None,
-    finalists: int = FINALISTS,
-    folds: int = 4,
-    pairs: bool = True,
     say: Callable[[str], None] = lambda text: None,
 ) -> Diagnosis:
-    """Find what a simulator lacks; `baseline` is its fit without effects to the problem's windows.
+    """Find what a simulator lacks whose misfit was detected.
 
-    First the simulator as it is; then every effect at every place, a few steps each on a part of the windows, on one
-    bench that holds them all; then the best of them on a bench of their own, to the end.
+    First every effect at every place, a few steps each on a part of the windows, on one bench that holds them all;
+    then the best of them on a bench of their own, to the end, and in pairs where one is not enough.
     """
     thresholds = thresholds or Thresholds()
-    chosen, nothing = problem.chosen, Candidate()
-    bench = problem.bench(())
-    work = _Work(key, bench, problem.group, chosen, noise_floor(bench.shots), say)
-    x = bench.starts(nothing, baseline.z)[0]
-    start = bench.fit(nothing, x, baseline.delta, baseline.sigma, work.mask(chosen), steps=8)
-    start = work.settle(nothing, start, chosen)
-    none = _enter(work, nothing, start, folds)
-    say(f"no mismatch has p = {none.misfit.p_value:.3f}")
-    if none.misfit.p_value >= FALSE_ALARMS or not problem.pairs:
-        return Diagnosis("no_mismatch", bench, none, [])
     say(f"trying {len(problem.pairs)} candidates; compiling takes a while")
-    ranked = _screen(problem, start, say)
-    kept = _with_relatives(problem, [k for k, _ in ranked], finalists)
-    bench = problem.bench(kept)
-    work = _Work(key, bench, problem.group, chosen, noise_floor(bench.shots), say)
-    entries = _finish(work, start, [Candidate((k,)) for k in range(len(kept))], folds)
-    if pairs and entries and share_left(entries[0], none) > thresholds.left:
-        entries = _extend(work, entries, folds)
+    ranked = _screen(problem, none.fit, say)
+    bench = problem.bench(_with_relatives(problem, [k for k, _ in ranked], FINALISTS))
+    work = _Work(key, bench, problem.group, problem.chosen, noise_floor(bench.shots), say)
+    entries = _finish(work, none.fit, [Candidate((k,)) for k in range(len(bench.pairs))], FOLDS)
+    if entries and share_left(entries[0], none) > thresholds.left:
+        entries = _extend(work, entries, FOLDS)
     listed = [(f"{problem.pairs[k][0].name}@{at(problem.pairs[k][1])}", gain) for k, gain in ranked]
     return _decide(work, none, entries, listed, thresholds)
+
+
+def _quiet(text: str) -> None:
+    """Say nothing."""
 
 
 def _with_relatives(problem: Problem, ranked: Sequence[int], finalists: int) -> list[tuple[Any, str]]:
@@ -222,28 +227,39 @@ def _screen(problem: Problem, start: Fit, say: Callable[[str], None]) -> list[tu
     """Every pair and what it lowers the cost by in a few steps, the best first."""
     rows = np.flatnonzero(problem.chosen)
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, SCREENED).astype(int))]
-    nothing, found = Candidate(), []
-    for heavy in (False, True):
-        numbers = [k for k, (effect, _) in enumerate(problem.pairs) if (effect.name in HEAVY) == heavy]
-        if not numbers:
-            continue
-        bench = problem.bench([problem.pairs[k] for k in numbers], rows)
-        delta, mask = start.delta[rows], bench.shots.measured
-        before = bench.fit(nothing, bench.starts(nothing, start.z[: bench.d])[0], delta, start.sigma, mask, steps=3)
-        for i, k in enumerate(numbers):
-            candidate = Candidate((i,))
-            if not bench.fits(candidate):
-                continue
-            costs = [
-                float(bench.fit(candidate, x, before.delta, start.sigma, mask, steps=STEPS).cost)
-                for x in bench.starts(candidate, start.z[: bench.d])
-            ]
-            costs = [cost for cost in costs if np.isfinite(cost)]
-            if costs:
-                found.append((k, float(before.cost) - min(costs)))
-            if i % 20 == 19:
-                say(f"tried {i + 1} of {len(numbers)}")
+    groups = [
+        [k for k, (effect, _) in enumerate(problem.pairs) if (effect.name in HEAVY) == heavy] for heavy in (False, True)
+    ]
+    with ThreadPoolExecutor(len(groups)) as pool:  # each compiles a program of its own
+        parts = pool.map(lambda numbers: _screen_group(problem, start, rows, numbers, say), groups)
+        found = [item for part in parts for item in part]
     return sorted(found, key=lambda item: -item[1])
+
+
+def _screen_group(
+    problem: Problem, start: Fit, rows: np.ndarray, numbers: Sequence[int], say: Callable[[str], None]
+) -> list[tuple[int, float]]:
+    """Some of the pairs, on one bench."""
+    if not numbers:
+        return []
+    nothing, found = Candidate(), []
+    bench = problem.bench([problem.pairs[k] for k in numbers], rows)
+    delta, mask = start.delta[rows], bench.shots.measured
+    before = bench.fit(nothing, bench.starts(nothing, start.z[: bench.d])[0], delta, start.sigma, mask, steps=3)
+    for i, k in enumerate(numbers):
+        candidate = Candidate((i,))
+        if not bench.fits(candidate):
+            continue
+        costs = [
+            float(bench.fit(candidate, x, before.delta, start.sigma, mask, steps=STEPS).cost)
+            for x in bench.starts(candidate, start.z[: bench.d])
+        ]
+        costs = [cost for cost in costs if np.isfinite(cost)]
+        if costs:
+            found.append((k, float(before.cost) - min(costs)))
+        if i % 20 == 19:
+            say(f"tried {i + 1} of {len(numbers)}")
+    return found
 
 
 def _fit(work: _Work, candidate: Candidate, start: Fit, known: Fit | None = None, own: Candidate | None = None) -> Any:
@@ -295,7 +311,7 @@ def _extend(work: _Work, entries: list[Entry], folds: int) -> list[Entry]:
 def enter(key: PRNGKeyArray, problem: Problem, bench: Bench, candidate: Candidate, start: Fit, folds: int = 2) -> Entry:
     """Fit one candidate of another bench from a baseline's fit, and score it as all candidates are."""
     chosen = problem.chosen
-    work = _Work(key, bench, problem.group, chosen, noise_floor(bench.shots), lambda text: None)
+    work = _Work(key, bench, problem.group, chosen, noise_floor(bench.shots), _quiet)
     x = bench.starts(Candidate(), start.z[: bench.d])[0]
     fit = bench.fit(candidate, x, start.delta, start.sigma, work.mask(chosen), steps=10)
     return _enter(work, candidate, work.settle(candidate, fit, chosen, rounds=3, steps=8), folds)

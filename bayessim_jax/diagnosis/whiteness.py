@@ -1,4 +1,4 @@
-"""Is there a mismatch at all: residuals of a simulator that explains a recording are white, those of another are smooth.
+"""Is there a mismatch at all: a simulator that explains a recording leaves white residuals, another one smooth ones.
 
 The statistic is the power of the residuals in the slowest cosines of every window, in units of the noise that their
 second differences show. Its null distribution needs no simulation: what a fit leaves of white noise is the noise minus
@@ -31,7 +31,7 @@ class Misfit:
 
     p_value: float
     excess: Float[np.ndarray, "windows obs"]
-    """Slow power of each window and channel above what noise leaves there, in units of σ²; on average 0 without misfit."""
+    """Slow power of each window and channel above what noise leaves there, in units of σ²: 0 on average if clean."""
     noise: Float[np.ndarray, " obs"]
     """White noise of each channel."""
 

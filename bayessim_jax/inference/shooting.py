@@ -193,7 +193,7 @@ def solve(
 
     def body(carry: Any) -> Any:
         tried, kept, here, damping, count, small = carry
-        there = linearize(predict, shots, *tried, sigma, step=step)
+        there = linearize(predict, shots, tried[0], tried[1], sigma, step=step)
         sound = jnp.isfinite(there.cost) & jnp.isfinite(there.gradient).all() & jnp.isfinite(there.hessian).all()
         better = sound & (there.cost <= here.cost)
         gain = jnp.where(better, (here.cost - there.cost) / jnp.maximum(jnp.abs(here.cost), 1e-12), 1.0)

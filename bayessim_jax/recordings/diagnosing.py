@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +16,17 @@ from jaxtyping import Array, Float
 from bayessim_jax.diagnosis.bench import Bench, Candidate
 from bayessim_jax.diagnosis.flexible import FEATURES, FlexibleForce, features
 from bayessim_jax.diagnosis.locate import Location, find_regime, find_windows_of, shares_from_left
-from bayessim_jax.diagnosis.procedure import Diagnosis, Entry, Problem, Thresholds, diagnose, enter, share_left
+from bayessim_jax.diagnosis.procedure import (
+    Diagnosis,
+    Entry,
+    Problem,
+    Thresholds,
+    detect,
+    enter,
+    name_effects,
+    share_left,
+)
+from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS
 from bayessim_jax.effects import EFFECTS, Scales, effect_places, recorded_scales
 from bayessim_jax.inference.scores import Score, compare, error_spread, score
 from bayessim_jax.inference.shooting import Fit
@@ -171,7 +182,7 @@ def case_problem(
     fitted, held = _thin(fitted, MOST_FITTED), _thin(held, MOST_HELD)
     model, fit = settle_step(key, model, fitted, say=say)
     windows = join(fitted, held)
-    system = model.system
+    system: Any = model.system
     pairs = tuple((effect, place) for effect in EFFECTS.values() for place in effect_places(effect, system))
     joints = [f"joint/{name}" for name, kind, *_ in model.case.layout.joints if kind in (2, 3)]
     problem = Problem(
@@ -221,24 +232,32 @@ def diagnose_case(
     model, problem, windows, baseline = case_problem(fit_key, model, say=say)
     chosen = problem.chosen
     say(f"{int(chosen.sum())} windows choose, {int((~chosen).sum())} judge")
-    result = diagnose(key, problem, baseline, thresholds=thresholds, say=say)
-    bench = result.bench
+    plain, none = detect(key, problem, baseline)
+    say(f"no mismatch has p = {none.misfit.p_value:.3f}")
     flexible, bench_flexible, places, shares, forces = None, None, [], np.zeros(0), {}
-    if result.verdict != "no_mismatch":
-        say("fitting a residual force without a name")
-        flexible, bench_flexible, places, shares, forces = _flexible(key, model, problem, windows, result)
+    if none.misfit.p_value >= FALSE_ALARMS:
+        result = Diagnosis("no_mismatch", plain, none, [])
+    else:
+        with ThreadPoolExecutor(1) as pool:  # the residual force without a name is compiled and fitted beside
+            beside = pool.submit(_flexible, key, model, problem, windows, none)
+            result = name_effects(key, problem, none, thresholds=thresholds, say=say)
+            say("fitting a residual force without a name")
+            found = beside.result()
+        if result.verdict != "no_mismatch":
+            flexible, bench_flexible, places, shares, forces = found
+    bench = result.bench
     scale = channel_scale(bench.shots)
     entries = {"baseline": result.baseline, "augmented": result.best}
-    predictions = {name: _restarted(bench, entry) for name, entry in entries.items()}
+    predictions = {which: _restarted(bench, entry) for which, entry in entries.items()}
     if flexible is not None and bench_flexible is not None:
         predictions["flexible"] = _restarted(bench_flexible, flexible)
     scores, spreads = {}, {}
     y, measured = np.asarray(bench.shots.y), np.asarray(bench.shots.measured)
-    for name, predicted in predictions.items():
+    for which, predicted in predictions.items():
         reference = compare(predicted[chosen], y[chosen], measured[chosen])
-        spreads[name] = error_spread(reference, scale)
-        scores[name] = score(
-            compare(predicted[~chosen], y[~chosen], measured[~chosen]), spreads[name], scale, bench.channels
+        spreads[which] = error_spread(reference, scale)
+        scores[which] = score(
+            compare(predicted[~chosen], y[~chosen], measured[~chosen]), spreads[which], scale, bench.channels
         )
     locations = _locations(model, windows, chosen, result, places, shares, forces)
     return CaseDiagnosis(
@@ -255,7 +274,7 @@ def diagnose_case(
         predictions=predictions,
         scale=scale,
         noise_floor=_floor(bench, result.best, scale, model, chosen),
-        theta={name: _theta(bench, entry) for name, entry in entries.items()},
+        theta={which: _theta(bench, entry) for which, entry in entries.items()},
         probabilities=_probabilities(result),
         next_experiment=_advice(result),
     )
@@ -285,7 +304,7 @@ def _floor(bench: Bench, entry: Entry, scale: np.ndarray, model: CaseModel, chos
 
 
 def _flexible(
-    key: Array, model: CaseModel, problem: Problem, windows: Windows, result: Diagnosis
+    key: Array, model: CaseModel, problem: Problem, windows: Windows, none: Entry
 ) -> tuple[Entry, Bench, list[str], np.ndarray, dict[str, tuple[np.ndarray, ...]]]:
     """A flexible force at all joints, what each joint alone explains, and the forces along the recordings."""
     joints = [(name, q, v) for name, kind, q, v in model.case.layout.joints if kind in (2, 3)]
@@ -293,12 +312,12 @@ def _flexible(
     scales, chosen = {p: problem.scales[p] for p in places}, problem.chosen
     pairs = [(FlexibleForce(p, scales[p]), p) for p in places]
     bench = problem.bench(pairs, slots=FEATURES * len(places))
-    start = result.baseline.fit
+    start = none.fit
     entry = enter(key, problem, bench, Candidate(tuple(range(len(pairs)))), start)
-    left = [share_left(entry, result.baseline)]
+    left = [share_left(entry, none)]
     if len(places) > 1:
         alone = [enter(key, problem, bench, Candidate((k,)), start, 1) for k in range(len(places))]
-        left = [share_left(e, result.baseline) for e in alone]
+        left = [share_left(e, none) for e in alone]
     weights = np.asarray(jnp.stack([bench.each[0].value(z) for z in entry.fit.z[bench.d :]]))
     forces = {}
     gears = _gears(model)
@@ -306,9 +325,8 @@ def _flexible(
     for k, (place, (_, q, v)) in enumerate(zip(places, joints, strict=True)):
         position, velocity = windows.qpos[:, :-1, q][rows], windows.qvel[:, :-1, v][rows]
         drive = (windows.ctrl @ gears[:, v])[rows] if windows.ctrl.shape[-1] else np.zeros(rows.sum())
-        phi = np.stack(
-            [np.broadcast_to(np.asarray(f), position.shape) for f in features(position, velocity, drive, scales[place])]
-        )
+        state = (jnp.asarray(position), jnp.asarray(velocity), jnp.asarray(drive))
+        phi = np.stack([np.asarray(f) for f in features(*state, scales[place])])
         own = weights[k * FEATURES : (k + 1) * FEATURES]
         time = (windows.start[:, None] + windows.time[:, :-1])[rows]
         forces[place] = (scales[place].force * (own @ phi), position, velocity, drive, time)
@@ -343,19 +361,18 @@ def _locations(
     when = find_windows_of(excess, names, windows.start[chosen], model.case.case.horizon)
     named = {}
     if result.verdict == "explained":
-        for name in result.best.names:
-            place = name.partition("@")[2]
-            named[_joint_of(model, place)] = place
+        own = [name.partition("@")[2] for name in result.best.names]
+        named = {_joint_of(model, place): place for place in own}
     found = []
-    for k in np.argsort(-shares):
+    for k in np.argsort(-shares).tolist():
         place = places[k]
         force, position, velocity, drive, time = forces[place]
         regime = find_regime(force, position, velocity, drive, time, result.bench.scales[place])
         if shares[k] >= 0.02 or not found:
             found.append(Location(named.get(place, place), float(shares[k]), regime, when))
-    total = sum(place.share for place in found)
-    for place in found:
-        place.share = round(place.share / total, 4)
+    total = sum(location.share for location in found)
+    for location in found:
+        location.share = round(location.share / total, 4)
     return sorted(found, key=lambda place: (place.at not in named.values(), -place.share))
 
 

@@ -67,7 +67,8 @@ def simulator_of(model: CaseModel, state: dict[str, Any], name: str) -> tuple[An
         (FlexibleForce(place, scales[place]) if effect == FLEXIBLE else lookup_effect(effect), place)
         for effect, place in entry["effects"]
     ]
-    system = with_effects(model.system, pairs, scales) if pairs else model.system
+    plain: Any = model.system
+    system = with_effects(plain, pairs, scales) if pairs else plain
     return system, jnp.asarray([*entry["theta"], *entry["values"]], float)
 
 
@@ -111,7 +112,8 @@ BEFORE_ROWS = 25
 
 def with_recordings(case: LoadedCase, pattern: str) -> LoadedCase:
     """The same case with recordings from elsewhere; raises `CaseError` for one that cannot be used."""
-    files = sorted(Path(name) for name in glob(pattern, recursive=True) if Path(name).is_file())
+    names = glob(pattern, recursive=True)  # noqa: PTH207 - the pattern may be absolute
+    files = sorted(Path(name) for name in names if Path(name).is_file())
     if not files:
         ends = ", ".join(SUFFIXES)
         raise CaseError("--recordings", f"no file matches {pattern!r}", f"correct the pattern; files end in {ends}")

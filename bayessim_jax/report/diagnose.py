@@ -36,12 +36,12 @@ def headline(diagnosis: CaseDiagnosis) -> str:
             f"{held} miss by {number(100 * before)} % of a channel's spread."
         )
     if result.verdict == "unexplained":
-        best = result.entries[0] if result.entries else None
-        closest = f" The closest, {' + '.join(best.names)}, leaves {number(100 * share_left(best, result.baseline))} %."
-        return (
-            f"Something is missing at {where or 'no single joint'}, and none of the candidates explains it."
-            f"{closest if best else ''}"
-        )
+        sentence = f"Something is missing at {where or 'no single joint'}, and none of the candidates explains it."
+        if result.entries:
+            best = result.entries[0]
+            left = number(100 * share_left(best, result.baseline))
+            sentence += f" The closest, {' + '.join(best.names)}, leaves {left} % of the misfit."
+        return sentence
     change = f"{held} miss by {number(100 * after)} % of a channel's spread instead of {number(100 * before)} %"
     if result.verdict == "ambiguous":
         sets = " or ".join(" + ".join(entry.names) for entry in result.confusion)
