@@ -365,7 +365,7 @@ def _locations(
         named = {_joint_of(model, place): place for place in own}
     found = []
     for k in np.argsort(-shares).tolist():
-        place = places[k]
+        place = str(places[k])
         force, position, velocity, drive, time = forces[place]
         regime = find_regime(force, position, velocity, drive, time, result.bench.scales[place])
         if shares[k] >= 0.02 or not found:
