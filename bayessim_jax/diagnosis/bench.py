@@ -52,6 +52,11 @@ class Tried:
     """Where the free parameters stand in [θ, effects' parameters, a place for those that are not used]."""
     on: Bool[Array, " e"]
     """Which of the effects' parameters are not neutral."""
+    low: Float[Array, " e"]
+    """Ranges of the effects' parameters. They are arguments and not constants of the program, because recordings decide
+    them: another case of the same model then finds the program in the compilation cache."""
+    high: Float[Array, " e"]
+    neutral: Float[Array, " e"]
 
 
 @dataclass(frozen=True)
@@ -126,11 +131,9 @@ class Bench:
         index = np.concatenate([index, np.full(self.size - len(index), unused)]).astype(int)
         on = np.isin(np.arange(len(self.parameters)), columns)
         windows = self.shots.y.shape[0]
-        inputs = Tried(
-            self.shots.inputs,
-            jnp.broadcast_to(jnp.asarray(index), (windows, index.size)),
-            jnp.broadcast_to(jnp.asarray(on), (windows, on.size)),
-        )
+        shared = (index, on, [m.a for m in self.each], [m.b for m in self.each], self.neutral)
+        arrays = (jnp.asarray(x) for x in (*shared[:2], *(np.asarray(x, float) for x in shared[2:])))
+        inputs = Tried(self.shots.inputs, *(jnp.broadcast_to(x, (windows, x.size)) for x in arrays))
         mask = self.shots.measured if measured is None else measured
         return dataclasses.replace(self.shots, inputs=inputs, measured=mask)
 
@@ -157,15 +160,16 @@ class Bench:
     @cached_property
     def predict(self) -> Any:
         """`predict(x, δ, tried)`; the same function for every candidate."""
-        d, neutral, margins, union = self.d, jnp.asarray(self.neutral), self.margins, self.union
-        each = self.each
+        d, margins, union, each = self.d, self.margins, self.union, self.each
 
         def predict(x: Array, delta: Array, tried: Tried) -> Array:
             z = jnp.zeros(d + len(each) + 1, x.dtype).at[tried.index].set(x)
             theta = margins.theta(z[:d])
             if each:
-                values = jnp.stack([m.value(z[d + k]) for k, m in enumerate(each)])
-                theta = jnp.concatenate([theta, jnp.where(tried.on, values, neutral)])
+                own = [
+                    dataclasses.replace(m, a=tried.low[k], b=tried.high[k]).value(z[d + k]) for k, m in enumerate(each)
+                ]
+                theta = jnp.concatenate([theta, jnp.where(tried.on, jnp.stack(own), tried.neutral)])
             return replay_window(union, theta, delta, tried.window)
 
         return predict

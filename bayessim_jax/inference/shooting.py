@@ -9,7 +9,7 @@ one, under the recorded commands; what the sensors show is the prediction plus i
 eliminated from the normal equations by itself, so a step costs as much as W small problems. Because the initial states
 are inferred with θ, a wrong initial state is not taken for physics.
 
-Source: Bock 1983 (multiple shooting); Levenberg 1944 and Marquardt 1963 (damping); Nocedal and Wright 2006, chapter 10
+Source: Bock 1983 (multiple shooting); Marquardt 1963 (damping); Nocedal and Wright 2006, chapter 10
 """
 
 from __future__ import annotations

@@ -1,0 +1,112 @@
+"""One simulator that holds every effect: neutral, it is the simulator without them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bayessim_jax.diagnosis.bench import Candidate
+from bayessim_jax.diagnosis.procedure import Entry, Problem, Thresholds, _contains_another, _ties
+from bayessim_jax.effects import EFFECTS, Scales
+from bayessim_jax.inference.replay import replay_window
+from bayessim_jax.recordings.loading import load_case
+from bayessim_jax.recordings.shots import case_model
+from benchmarks.worlds import make_case
+
+PAIRS = (
+    ("coulomb_friction", "joint/hinge"),
+    ("stribeck_friction", "joint/hinge"),
+    ("actuator_delay", "actuator/motor"),
+    ("actuator_saturation", "actuator/motor"),
+    ("armature", "joint/hinge"),
+)
+
+
+@pytest.fixture(scope="module")
+def problem(tmp_path_factory):
+    jax.config.update("jax_enable_x64", True)
+    folder = tmp_path_factory.mktemp("bench") / "rig"
+    make_case(folder, "pendulum", "coulomb_friction", seed=3, recordings=2, seconds=2.0)
+    model = case_model(load_case(folder).check(), before=10)
+    windows = model.windows([0, 1])
+    scales = {place: Scales(timestep=0.002, period=0.004) for _, place in PAIRS}
+    pairs = tuple((EFFECTS[name], place) for name, place in PAIRS)
+    yield Problem(
+        model.system,
+        model.margins,
+        pairs,
+        scales,
+        model.shots(windows),
+        windows.recording,
+        np.ones(len(windows), bool),
+    )
+    jax.config.update("jax_enable_x64", False)
+
+
+def predicted(bench, candidate, x):
+    shots = bench.setup(candidate)
+    still = jnp.zeros((shots.y.shape[0], shots.spread.size))
+    return jax.vmap(bench.predict, in_axes=(None, 0, 0))(x, still, shots.inputs)
+
+
+def test_no_candidate_is_the_simulator_as_it_is(problem):
+    bench = problem.bench(problem.pairs)
+    x = bench.starts(Candidate(), jnp.array([0.3]))[0]
+    theta = problem.margins.theta(jnp.array([0.3]))
+    plain = jax.vmap(lambda w: replay_window(problem.system, theta, jnp.zeros(2), w))(problem.shots.inputs)
+    np.testing.assert_allclose(predicted(bench, Candidate(), x), plain, atol=1e-10)
+
+
+def test_a_candidate_has_its_own_parameters_in_physical_units(problem):
+    bench = problem.bench(problem.pairs)
+    stribeck = Candidate((1,))
+    assert bench.columns(stribeck) == [1, 2, 3]
+    x = bench.starts(stribeck, jnp.array([0.0]))[-1]
+    values = bench.values(stribeck, x)
+    own = EFFECTS["stribeck_friction"].parameters("joint/hinge", problem.scales["joint/hinge"])
+    assert [key.rpartition("/")[2] for key in values] == [p.name for p in own]
+    np.testing.assert_allclose(list(values.values()), [p.start for p in own], rtol=1e-6)
+    both = stribeck + Candidate((0,))
+    assert both.effects == (0, 1) and bench.names(both) == [
+        "coulomb_friction@joint/hinge",
+        "stribeck_friction@joint/hinge",
+    ]
+    assert bool((bench.free(stribeck) == jnp.array([True] * 4 + [False] * 3)).all())
+
+
+def test_the_concealed_effect_lowers_the_cost_most(problem):
+    bench = problem.bench(problem.pairs)
+    sigma = jnp.array([0.02, 0.2])
+    mask = problem.shots.measured
+    costs = []
+    for k in range(len(problem.pairs)):
+        fits = [
+            bench.fit(Candidate((k,)), x, jnp.zeros((mask.shape[0], 2)), sigma, mask)
+            for x in bench.starts(Candidate((k,)), jnp.array([0.0]))
+        ]
+        costs.append(min(float(fit.cost) for fit in fits))
+    assert int(np.argmin(costs)) in (0, 1)
+    assert costs[0] < 0.2 * min(costs[2:])
+
+
+def entry(names, scores):
+    return Entry(Candidate(), names, None, np.asarray(scores, float), None, np.ones(1))
+
+
+def test_a_special_case_wins_over_what_contains_it():
+    coulomb, stribeck = entry(["coulomb_friction@joint/a"], [0.0]), entry(["stribeck_friction@joint/a"], [0.0])
+    elsewhere = entry(["coulomb_friction@joint/b"], [0.0])
+    assert _contains_another(stribeck, [coulomb, stribeck])
+    assert not _contains_another(coulomb, [coulomb, stribeck])
+    assert not _contains_another(stribeck, [elsewhere, stribeck])
+
+
+def test_ties_are_within_the_error_of_the_difference():
+    rng = np.random.default_rng(0)
+    best = entry(["a@x"], rng.normal(100, 1, 30))
+    chosen = np.ones(30, bool)
+    same, worse = entry(["b@x"], rng.normal(100, 1, 30)), entry(["c@x"], best.scores - 20)
+    lost = entry(["d@x"], best.scores - np.where(np.arange(30) == 3, 1e6, 5.0))
+    assert _ties(same, best, chosen, Thresholds())
+    assert not _ties(worse, best, chosen, Thresholds())
+    assert not _ties(lost, best, chosen, Thresholds())
