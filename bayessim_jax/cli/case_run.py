@@ -57,8 +57,9 @@ class CaseRun:
             loaded = load_case(case).check()
             if not loaded.parameters:
                 raise ValueError(f"{case}: case.toml names no parameters to infer; add [[parameters]].")
-            if loaded.model is None:
-                raise ValueError(f"{case}: cases of a registered system cannot be fitted yet; give the model as MJCF.")
+            if loaded.model is None and name == "diagnose":
+                what = f"{case}: system {loaded.case.system} is a registered one"
+                raise ValueError(f"{what}, and effects are tried on MuJoCo models only; give the model as MJCF.")
             folder = RunFolder(out or Path("runs") / f"{loaded.case.folder.resolve().name}-{name}").create()
         except ValueError as error:
             raise UsageError(str(error)) from error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -14,7 +15,7 @@ from jaxtyping import Array, Float
 from bayessim_jax.beliefs.margins import Margins
 from bayessim_jax.systems.mjcf import MjcfSystem, displace
 
-__all__ = ["Inputs", "make_predictor", "replay_window"]
+__all__ = ["Inputs", "Restarted", "make_predictor", "replay_window"]
 
 
 @struct.dataclass
@@ -31,11 +32,47 @@ class Inputs:
     """When the window begins, s in its recording."""
 
 
+@dataclass(frozen=True, eq=False)
+class Restarted:
+    """A system that is restarted from what its sensors show: how recordings of a registered system are replayed.
+
+    θ are some of its parameters; the others stay at `others`. Its engine is itself.
+    """
+
+    system: Any
+    others: Float[Array, " e"]
+    index: tuple[int, ...]
+    """Place of each of θ among the system's parameters."""
+
+    name = "analytic"
+    reason = "analytic, the registered system's own equations"
+    substeps = 1
+
+    @property
+    def dt(self) -> float:
+        """One control period, s."""
+        return self.system.dt
+
+    def replay(self, theta: Array, observation: Float[Array, " obs"], ctrl: Array) -> Float[Array, "rows obs"]:
+        """Observations of every row, from the one that the first row shows."""
+        full = self.others.at[jnp.asarray(self.index)].set(theta)
+
+        def once(state: Any, action: Array) -> tuple[Any, Array]:
+            after = self.system.step(full, state, action)
+            return after, self.system.observe(full, after)
+
+        state = self.system.restart(full, observation)
+        after = jax.lax.scan(once, state, ctrl)[1]
+        return jnp.concatenate([self.system.observe(full, state)[None], after])
+
+
 def replay_window(system: Any, theta: Array, delta: Float[Array, " n"], window: Inputs) -> Float[Array, "rows obs"]:
     """What the sensors show in every row of a window that begins δ beside the recorded state.
 
-    `system` is an `MjcfSystem`, or one with effects.
+    `system` is an `MjcfSystem`, one with effects, or `Restarted`, whose observations stand under `qpos`.
     """
+    if isinstance(system, Restarted):
+        return system.replay(theta, window.qpos + delta, window.ctrl)
     nv = system.engine.model.nv
     qpos, qvel = displace(system.engine.model, window.qpos, delta[:nv]), window.qvel + delta[nv:]
     commanded = window.ctrl.shape[-1] > 0

@@ -203,7 +203,7 @@ def _scales(model: CaseModel, places: Sequence[str]) -> dict[str, Scales]:
     """How large things are at every place, over all recordings."""
     qpos, qvel, ctrl = (np.concatenate([getattr(r, n) for r in model.recordings]) for n in ("qpos", "qvel", "ctrl"))
     duration = max(float(r.time[-1] - r.time[0]) for r in model.recordings)
-    m, dt = model.system.engine.model, model.system.dt
+    m, dt = model.compiled, model.system.dt
     return {place: recorded_scales(m, place, qpos, qvel, ctrl, dt, duration) for place in dict.fromkeys(places)}
 
 
@@ -335,7 +335,7 @@ def _flexible(
 
 def _gears(model: CaseModel) -> Float[np.ndarray, "nu nv"]:
     """Torque on every joint for a command of one."""
-    m = model.system.engine.model
+    m = model.compiled
     gears = np.zeros((m.nu, m.nv))
     for i in range(m.nu):
         joint = int(m.actuator_trnid[i, 0])
@@ -379,7 +379,7 @@ def _locations(
 def _joint_of(model: CaseModel, place: str) -> str:
     """The joint at which an effect's place is felt; the place itself where there is none."""
     kind, _, rest = place.partition("/")
-    m = model.system.engine.model
+    m = model.compiled
     if kind == "actuator":
         joint = int(m.actuator(rest).trnid[0])
         return f"joint/{m.joint(joint).name}" if 0 <= joint < m.njnt else place

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from bayessim_jax.inference.direct import DirectPosterior, fit_direct, sample_direct
 from bayessim_jax.inference.identifiability import Identifiability, find_unidentified
+from bayessim_jax.inference.replay import Restarted
 from bayessim_jax.inference.scores import Score, error_spread, predict_windows, prediction_errors, score, smallest_error
 from bayessim_jax.inference.shooting import Fit, Shots, ridge
 from bayessim_jax.recordings.shots import CaseModel, case_model, predictor, split_windows
@@ -81,7 +82,7 @@ class CaseInference:
                 "diverged": max(s.diverged for s in self.scores.values()),
             },
             "identifiability": self.identifiability.as_table(),
-            "engine": {"name": self.model.system.engine.name, "reason": self.model.system.reason},
+            "engine": {"name": self.model.engine_name, "reason": self.model.system.reason},
             "sampler": self.posterior.sampler,
         }
 
@@ -90,6 +91,8 @@ def start_spread(model: CaseModel, fit: Fit) -> Float[np.ndarray, " n"]:
     """How far recorded initial states are off: their own noise where they were measured, else what the fit found."""
     moved = np.asarray(fit.delta)
     found = 1.4826 * np.median(np.abs(moved), axis=0)
+    if isinstance(model.system, Restarted):
+        return np.asarray(fit.sigma) if len(found) == len(model.channels) else found
     joints, nv = model.case.layout.joints, model.system.engine.model.nv
     sigma = dict(zip(model.channels, np.asarray(fit.sigma), strict=True))
     names = {v: (f"joint/{name}/qpos", f"joint/{name}/qvel") for name, kind, _, v in joints if kind in (2, 3)}
@@ -154,9 +157,9 @@ def settle_step(
     """
     predict, shots = predictor(model), model.shots(windows)
     fit = fit_direct(key, predict, shots, model.margins.size, step=model.step, say=say)
-    finer = case_model(
-        model.case, engine=model.system.engine.name, before=model.before, refined=REFINED * model.refined
-    )
+    if isinstance(model.system, Restarted):
+        return model, fit
+    finer = case_model(model.case, engine=model.engine_name, before=model.before, refined=REFINED * model.refined)
     coarse = _simulated(predict, shots.inputs, fit.z, fit.delta)
     fine = _simulated(predictor(finer), shots.inputs, fit.z, fit.delta)
     error = np.where(np.asarray(shots.measured), np.asarray(coarse - fine) / np.asarray(fit.sigma), 0.0)

@@ -36,7 +36,8 @@ def write_inference(folder: RunFolder, result: CaseInference, seed: int) -> None
     write_text(folder.path / "inference.json", to_json(result.table(), indent=2) + "\n")
     _write_posterior(folder.path / "posterior.nc", result, seed)
     means = dict(zip(result.model.margins.names, np.asarray(result.posterior.draws).mean(0).tolist(), strict=True))
-    write_model(folder.path / "model_posterior.xml", result.model.case, means)
+    if result.model.case.model is not None:
+        write_model(folder.path / "model_posterior.xml", result.model.case, means)
 
 
 def write_model(

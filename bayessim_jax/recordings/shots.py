@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from bayessim_jax.beliefs.margins import Margin, Margins, log_normal, normal, uniform
-from bayessim_jax.inference.replay import Inputs, make_predictor
+from bayessim_jax.inference.replay import Inputs, Restarted, make_predictor
 from bayessim_jax.inference.shooting import Shots
 from bayessim_jax.recordings.priors import LogNormal, Normal, Prior
 from bayessim_jax.recordings.recording import CaseRecording, resample
@@ -48,7 +48,7 @@ class CaseModel:
     """A case ready to be compared: its system, its recordings on the system's time grid, and its channels."""
 
     case: LoadedCase
-    system: MjcfSystem
+    system: MjcfSystem | Restarted
     margins: Margins
     recordings: tuple[CaseRecording, ...]
     channels: tuple[str, ...]
@@ -62,7 +62,19 @@ class CaseModel:
     @property
     def step(self) -> float:
         """Length of the differences that stand for derivatives; 0 where the engine is differentiable."""
-        return 0.0 if self.system.engine.name in ("tree", "mjx") else 1e-3
+        return 1e-3 if self.engine_name == "mujoco" else 0.0
+
+    @property
+    def engine_name(self) -> str:
+        """What steps the system."""
+        return self.system.name if isinstance(self.system, Restarted) else self.system.engine.name
+
+    @property
+    def compiled(self) -> Any:
+        """The `mujoco.MjModel` that is stepped; raises `ValueError` for a registered system."""
+        if isinstance(self.system, Restarted):
+            raise ValueError(f"system {self.case.case.system} is no MuJoCo model; give the model as MJCF.")
+        return self.system.engine.model
 
     def windows(self, which: Sequence[int], horizon: float | None = None, stride: float | None = None) -> Windows:
         """Windows of some of the recordings; `recording` numbers them among all."""
@@ -90,7 +102,8 @@ class CaseModel:
             if self.before:
                 rows = np.maximum(np.arange(row - self.before, row), 0)
                 past[w] = recording.ctrl[rows]
-        return Inputs(*map(jnp.asarray, (windows.qpos[:, 0], windows.qvel[:, 0], windows.ctrl, past, windows.start)))
+        place = windows.sensors[:, 0] if isinstance(self.system, Restarted) else windows.qpos[:, 0]
+        return Inputs(*map(jnp.asarray, (place, windows.qvel[:, 0], windows.ctrl, past, windows.start)))
 
     def _stack(self, qpos: np.ndarray, qvel: np.ndarray, sensors: np.ndarray) -> np.ndarray:
         layout = self.case.layout
@@ -100,6 +113,8 @@ class CaseModel:
 
     def _spread(self) -> np.ndarray:
         """How far initial states may be off: as far as the recordings move at all."""
+        if isinstance(self.system, Restarted):
+            return np.maximum(np.concatenate([r.sensors for r in self.recordings]).std(0), 1e-3)
         nv = self.system.engine.model.nv
         qvel = np.concatenate([r.qvel for r in self.recordings])
         step = np.concatenate([_motions(self.system.engine.model, r.qpos) for r in self.recordings])
@@ -130,9 +145,8 @@ def case_model(case: LoadedCase, *, engine: str = "auto", before: int = 0, refin
     spaced, or at another rate than the others, are put on a uniform grid. Raises `ValueError` for what the engine does
     not take.
     """
-    if case.model is None:
-        raise ValueError(f"system {case.case.system} has no recordings' windows yet; give the model as MJCF.")
-    dt = float(np.median([r.step for r in case.recordings]))
+    restarted = _restarted(case) if case.model is None else None
+    dt = restarted.dt if restarted else float(np.median([r.step for r in case.recordings]))
     remarks, recordings = [], []
     for recording in case.recordings:
         steps = np.diff(recording.time)[recording.valid]
@@ -141,6 +155,11 @@ def case_model(case: LoadedCase, *, engine: str = "auto", before: int = 0, refin
             remarks.append(f"{recording.name} is put on a grid of {dt:g} s")
         else:
             recordings.append(recording)
+    if restarted:
+        channels = tuple(
+            c for i, c in enumerate(case.layout.sensors) if any(r.sensors_measured[:, i].any() for r in recordings)
+        )
+        return CaseModel(case, restarted, margins_of(case), tuple(recordings), channels, tuple(remarks), before)
     spec = case.spec.copy()
     substeps = max(round(dt / spec.option.timestep), 1)
     if abs(substeps * spec.option.timestep / dt - 1) > 1e-3:
@@ -163,6 +182,18 @@ def case_model(case: LoadedCase, *, engine: str = "auto", before: int = 0, refin
     unknowns = [Unknown(p.name, tuple(str(t) for t in p.targets), *_bounds(p.prior), p.unit) for p in case.parameters]
     system = mjcf_system(spec, unknowns, observe=channels, substeps=substeps, engine=engine)
     return CaseModel(case, system, margins_of(case), tuple(recordings), channels, tuple(remarks), before, refined)
+
+
+def _restarted(case: LoadedCase) -> Restarted:
+    """A registered system, its parameters that the case does not name in the middle of their box."""
+    from bayessim_jax.systems import lookup
+
+    system: Any = lookup(case.case.system).system()
+    if not hasattr(system, "restart"):
+        raise ValueError(f"system {case.case.system} cannot be restarted from recordings; give the model as MJCF.")
+    box = system.parameters
+    index = tuple(box.names.index(str(p.targets[0])) for p in case.parameters)
+    return Restarted(system, jnp.asarray((box.low + box.high) / 2, float), index)
 
 
 def _bounds(prior: Prior) -> tuple[float, float]:

@@ -78,7 +78,7 @@ def render(result: CaseInference, facts: Mapping[str, Any]) -> str:
         *notices,
         html.section("Parameters", _pairs(result), _parameters(result)),
         html.section("Recording against prediction", trace_figure(result), _scores(result)),
-        html.section("Replay", replay_figure(result)),
+        *([html.section("Replay", replay_figure(result))] if case.model is not None else []),
         html.section("What the predictions miss", html.figure(*_residuals(result), wide=True)),
         html.section(
             "What to do next",

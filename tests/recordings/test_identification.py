@@ -1,12 +1,14 @@
 """`infer_case` on made-up machines whose parameters are known."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from bayessim_jax.recordings.identification import infer_case
 from bayessim_jax.recordings.loading import load_case
 from bayessim_jax.recordings.shots import case_model, split_windows
+from bayessim_jax.systems.skid_steer import SkidSteer
 from benchmarks.worlds import make_case
 
 
@@ -78,6 +80,34 @@ def test_engines_agree_on_the_posterior(tmp_path):
     tree, c = (np.asarray(inferred(tmp_path / "rig", engine=e).posterior.draws) for e in ("tree", "mujoco"))
     assert tree.mean() == pytest.approx(c.mean(), abs=0.2 * tree.std())
     assert tree.std() == pytest.approx(c.std(), rel=0.2)
+
+
+def test_a_registered_system_is_restarted_from_its_observations(tmp_path):
+    """The skid-steer robot, simulated here with known parameters and recorded with noise."""
+    system = SkidSteer.create()
+    truth = jnp.array([0.07, 0.5, 0.1])
+    rng = np.random.default_rng(0)
+    (tmp_path / "recordings").mkdir()
+    for k in range(4):
+        state, rows = system.restart(truth, jnp.zeros(3)), []
+        ctrl = np.cumsum(rng.normal(size=(80, 2)), axis=0)
+        for t in range(80):
+            pose = np.asarray(system.observe(truth, state)) + 1e-3 * rng.normal(size=3)
+            rows.append([t * system.dt, *pose, *ctrl[t]])
+            state = system.step(truth, state, jnp.asarray(ctrl[t]))
+        header = "time,base/x,base/y,base/yaw,input/left,input/right"
+        np.savetxt(tmp_path / "recordings" / f"{k}.csv", rows, delimiter=",", header=header, comments="")
+    names = {"wheel_radius": (0.04, 0.1), "axial_distance": (0.3, 0.7), "icr_offset": (-0.3, 0.3)}
+    text = 'schema = 1\nsystem = "skid_steer"\nrecordings = "recordings/*.csv"\nhorizon = 1.0\n'
+    for name, (low, high) in names.items():
+        text += f'[[parameters]]\nname = "{name}"\ntargets = ["{name}"]\n'
+        text += f'prior = {{ distribution = "uniform", low = {low}, high = {high} }}\n'
+    (tmp_path / "case.toml").write_text(text)
+    result = inferred(tmp_path)
+    draws = np.asarray(result.posterior.draws)
+    assert (np.abs(draws.mean(0) - truth) < 5 * draws.std(0)).all()
+    assert (draws.std(0) < 0.1 * np.abs(truth)).all()
+    assert result.scores["posterior"].nrmse < 1.3 * result.noise_floor
 
 
 @pytest.mark.slow
