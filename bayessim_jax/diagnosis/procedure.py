@@ -40,6 +40,8 @@ HEAVY = frozenset({"sensor_delay", "hysteresis"})
 """Effects that cost several times what the others do: they are tried on a bench of their own."""
 FINALISTS, LEADERS, PAIRS = 10, 3, 4
 """Effects that are fitted to the end, those of them whose relatives are too, and pairs."""
+WORTH = 0.3
+"""Share of the best effect's first gain from which another is fitted to the end by itself, not in pairs alone."""
 FOLDS = 4
 """Groups of recordings, each scored by fits to the others."""
 
@@ -197,9 +199,13 @@ def name_effects(
     thresholds = thresholds or Thresholds()
     say(f"trying {len(problem.pairs)} candidates; compiling takes a while")
     ranked = _screen(problem, none.fit, say)
-    bench = problem.bench(_with_relatives(problem, [k for k, _ in ranked], FINALISTS))
+    order, gains = [k for k, _ in ranked], dict(ranked)
+    leaders = order[:LEADERS]
+    kept = [k for i, k in enumerate(order) if i < FINALISTS or any(_are_kin(problem, k, j) for j in leaders)]
+    worthy = [k for k in kept if gains[k] > WORTH * gains[order[0]] or any(_are_kin(problem, k, j) for j in leaders)]
+    bench = problem.bench([problem.pairs[k] for k in kept])
     work = _Work(key, bench, problem.group, problem.chosen, noise_floor(bench.shots), say)
-    entries = _finish(work, none.fit, [Candidate((k,)) for k in range(len(bench.pairs))], FOLDS)
+    entries = _finish(work, none.fit, [Candidate((kept.index(k),)) for k in dict.fromkeys([*leaders, *worthy])], FOLDS)
     if entries and share_left(entries[0], none) > thresholds.left:
         entries = _extend(work, entries, FOLDS)
     listed = [(f"{problem.pairs[k][0].name}@{at(problem.pairs[k][1])}", gain) for k, gain in ranked]
@@ -210,17 +216,11 @@ def _quiet(text: str) -> None:
     """Say nothing."""
 
 
-def _with_relatives(problem: Problem, ranked: Sequence[int], finalists: int) -> list[tuple[Any, str]]:
-    """The best pairs, and beside each of the first few what has it as a special case, or is one of it."""
-    kept = list(ranked[:finalists])
-    for k in ranked[:LEADERS]:
-        effect, place = problem.pairs[k]
-        for other in ranked[finalists:]:
-            relative, where = problem.pairs[other]
-            kin = effect.name in CONTAINS.get(relative.name, ()) or relative.name in CONTAINS.get(effect.name, ())
-            if kin and where == place and other not in kept:
-                kept.append(other)
-    return [problem.pairs[k] for k in kept]
+def _are_kin(problem: Problem, one: int, other: int) -> bool:
+    """Whether of two pairs at one place the one has the other as a special case."""
+    (effect, place), (relative, where) = problem.pairs[one], problem.pairs[other]
+    kin = effect.name in CONTAINS.get(relative.name, ()) or relative.name in CONTAINS.get(effect.name, ())
+    return kin and place == where
 
 
 def _screen(problem: Problem, start: Fit, say: Callable[[str], None]) -> list[tuple[int, float]]:
