@@ -13,13 +13,11 @@ from bayessim_jax.report import html
 from bayessim_jax.report.misfit import candidates_plot, misfit_map
 from bayessim_jax.report.residuals import residual_plot
 from bayessim_jax.report.style import BLUE, ORANGE, PURPLE
-from bayessim_jax.report.viewer import SCRIPT_HASH, compact, script, traces
+from bayessim_jax.report.timelines import window_traces
+from bayessim_jax.report.viewer import SCRIPT_HASH, script
 from bayessim_jax.report.words import number, plus_minus
 
 __all__ = ["headline", "render"]
-
-MOST_ROWS = 2400
-MOST_RECORDINGS = 8
 
 
 def headline(diagnosis: CaseDiagnosis) -> str:
@@ -107,33 +105,14 @@ def _series(diagnosis: CaseDiagnosis) -> list[dict[str, Any]]:
 
 
 def _traces(diagnosis: CaseDiagnosis) -> str:
-    windows, shots = diagnosis.windows, diagnosis.bench.shots
-    y, measured = np.asarray(shots.y), np.asarray(shots.measured)
-    series = _series(diagnosis)
-    recordings = []
-    held = np.flatnonzero(~diagnosis.chosen)
-    for index in sorted(set(windows.recording[held].tolist()))[:MOST_RECORDINGS]:
-        parts: dict[str, list[np.ndarray]] = {s["key"]: [] for s in series} | {"time": [], "start": []}
-        for w in (w for w in held if windows.recording[w] == index):
-            rows = np.concatenate([[True], windows.valid[w]])
-            parts["time"].append((windows.start[w] + windows.time[w])[rows])
-            parts["start"].append(np.arange(rows.sum()) == 0)
-            for s in series:
-                values = np.where(measured[w], y[w], np.nan)
-                parts[s["key"]].append((values if s["key"] == "measured" else diagnosis.predictions[s["key"]][w])[rows])
-        joined = {key: np.concatenate(x) for key, x in parts.items()}
-        thin = max(len(joined["time"]) // MOST_ROWS, 1)
-        keep = joined["start"] | (np.arange(len(joined["time"])) % thin == 0)
-        data: dict[str, Any] = {s["key"]: compact(joined[s["key"]][keep].T) for s in series}
-        data |= {"time": compact(joined["time"][keep], 7), "start": joined["start"][keep].astype(int).tolist()}
-        recordings.append((diagnosis.model.recordings[index].name, data))
-    units = diagnosis.model.case.layout.units
-    labels = [f"{c} [{units[c]}]" if units.get(c) else c for c in diagnosis.model.channels]
+    shots = diagnosis.bench.shots
+    values = {**diagnosis.predictions, "measured": np.where(np.asarray(shots.measured), np.asarray(shots.y), np.nan)}
     caption = (
         f"Held-out recordings; predictions restart from them every {diagnosis.model.case.case.horizon:g} s. The wheel "
         "zooms in time, dragging moves, a double click shows everything."
     )
-    return traces(recordings, labels, series, caption)
+    held = np.flatnonzero(~diagnosis.chosen)
+    return window_traces(diagnosis.model, diagnosis.windows, held, values, _series(diagnosis), caption)
 
 
 def _scores(diagnosis: CaseDiagnosis) -> str:

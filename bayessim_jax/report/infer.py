@@ -14,15 +14,14 @@ from bayessim_jax.report.pairs import pair_plot
 from bayessim_jax.report.residuals import residual_plot
 from bayessim_jax.report.skeleton import draw_positions, plane_of
 from bayessim_jax.report.style import BLUE, ORANGE
-from bayessim_jax.report.viewer import SCRIPT_HASH, animation, compact, script, traces
+from bayessim_jax.report.timelines import window_traces
+from bayessim_jax.report.viewer import SCRIPT_HASH, animation, script
 from bayessim_jax.report.words import number, plus_minus
 
 __all__ = ["headline", "render", "replay_figure", "trace_figure"]
 
-MOST_ROWS = 2400
-"""Rows of a recording that are drawn; longer ones are thinned out."""
-MOST_RECORDINGS = 8
 FRAMES = 160
+"""Of a replay."""
 
 
 def headline(result: CaseInference) -> str:
@@ -153,41 +152,21 @@ def _scores(result: CaseInference) -> str:
 def trace_figure(result: CaseInference) -> str:
     """The held-out windows of each recording, with predictions before and after."""
     shots = result.model.shots(result.held_out)
-    y, measured = np.asarray(shots.y), np.asarray(shots.measured)
-    band = np.quantile(result.band, [0.05, 0.95], axis=0)
-    recordings = []
-    for index in sorted(set(result.held_out.recording.tolist()))[:MOST_RECORDINGS]:
-        windows = np.flatnonzero(result.held_out.recording == index)
-        parts: dict[str, list[np.ndarray]] = {key: [] for key in ("time", "start", *KEYS)}
-        for w in windows:
-            rows = np.concatenate([[True], result.held_out.valid[w]])
-            parts["time"].append((result.held_out.start[w] + result.held_out.time[w])[rows])
-            parts["start"].append(np.arange(rows.sum()) == 0)
-            values = (np.where(measured[w], y[w], np.nan), result.predictions["baseline"][w])
-            for key, x in zip(KEYS, (*values, result.predictions["posterior"][w], band[0, w], band[1, w]), strict=True):
-                parts[key].append(x[rows])
-        joined = {key: np.concatenate(x) for key, x in parts.items()}
-        thin = max(len(joined["time"]) // MOST_ROWS, 1)
-        keep = joined["start"] | (np.arange(len(joined["time"])) % thin == 0)
-        data: dict[str, Any] = {key: compact(joined[key][keep].T) for key in KEYS}
-        data |= {"time": compact(joined["time"][keep], 7), "start": joined["start"][keep].astype(int).tolist()}
-        recordings.append((result.model.recordings[index].name, data))
+    low, high = np.quantile(result.band, [0.05, 0.95], axis=0)
+    measured = np.where(np.asarray(shots.measured), np.asarray(shots.y), np.nan)
+    values = {**result.predictions, "low": low, "high": high, "measured": measured}
     series = [
         {"key": "low", "upper": "high", "label": "posterior, 5 % to 95 %", "colour": BLUE},
         {"key": "baseline", "label": "before: the prior's mean", "colour": ORANGE, "scale": True},
         {"key": "posterior", "label": "after: the posterior's mean", "colour": BLUE, "scale": True},
         {"key": "measured", "label": "recording", "dots": True, "scale": True},
     ]
-    units = result.model.case.layout.units
-    labels = [f"{c} [{units[c]}]" if units.get(c) else c for c in result.model.channels]
     caption = (
         f"Predictions restart from the recording every {result.model.case.case.horizon:g} s; none of these rows took "
         "part in the fit. The wheel zooms in time, dragging moves, a double click shows everything."
     )
-    return traces(recordings, labels, series, caption)
-
-
-KEYS = ("measured", "baseline", "posterior", "low", "high")
+    windows = result.held_out
+    return window_traces(result.model, windows, np.arange(len(windows)), values, series, caption)
 
 
 def replay_figure(result: CaseInference) -> str:

@@ -1,6 +1,7 @@
 """`bayessim infer` as a person runs it."""
 
 import json
+import re
 
 import mujoco
 import numpy as np
@@ -10,6 +11,7 @@ import xarray as xr
 from bayessim_jax.cli.main import main
 from bayessim_jax.recordings.results import sample_models
 from benchmarks.worlds import make_case
+from tests.browser import CHROMIUM, open_in_chromium
 
 
 @pytest.fixture(scope="module")
@@ -68,3 +70,11 @@ def test_the_report_is_one_page_that_shows_everything(run):
     page = (folder / "run" / "report.html").read_text()
     assert "mass is" in page and page.count("<canvas") == 2 and page.count("<svg") >= 3
     assert "http" not in page.replace("http://www.w3.org", "").replace("http-equiv", "")
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+def test_the_reports_scripts_run_and_draw(run, tmp_path):
+    page = (run[0] / "run" / "report.html").read_text()
+    dom, errors = open_in_chromium(page, tmp_path)
+    assert errors == []
+    assert len(re.findall(r"<canvas[^>]* style=.height", dom)) == 2

@@ -1,6 +1,7 @@
 """Diagnoses of made-up machines with something concealed in them, and of clean ones."""
 
 import json
+import re
 
 import jax
 import mujoco
@@ -9,6 +10,7 @@ import pytest
 
 from bayessim_jax.cli.main import main
 from benchmarks.worlds import make_case
+from tests.browser import CHROMIUM, open_in_chromium
 
 
 @pytest.fixture(scope="module")
@@ -111,3 +113,11 @@ def test_white_residuals_have_uniform_p_values():
     smooth = judge_misfit(jax.random.key(0), (noise + wave)[..., None], jax.numpy.asarray(slopes), measured)
     assert smooth.p_value < 0.01
     assert smooth.noise[0] == pytest.approx(0.3, rel=0.15)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+def test_the_reports_scripts_run_and_draw(friction, tmp_path):
+    page = (friction[0] / "report.html").read_text()
+    dom, errors = open_in_chromium(page, tmp_path)
+    assert errors == []
+    assert len(re.findall(r"<canvas[^>]* style=.height", dom)) == 1

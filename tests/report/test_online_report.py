@@ -1,17 +1,10 @@
 import re
-import shutil
-import subprocess
 
 import pytest
 
 from bayessim_jax.report.online import render
+from tests.browser import CHROMIUM, open_in_chromium
 from tests.report.made_up import made_up
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-FLAGS = [
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync", "--enable-logging=stderr",
-]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -66,14 +59,6 @@ def test_every_kind_of_run_has_a_report(options):
     page = render(made_up(rounds=2, **options))
     assert ("truth" in re.sub("<[^>]*>", "", page).lower()) == options.get("known", True)
     assert ("simulation-based calibration" in page.lower()) == ("seeds" in options)
-
-
-def open_in_chromium(html, folder):
-    path = folder / "report.html"
-    path.write_text(html)
-    command = [CHROMIUM, *FLAGS, f"--user-data-dir={folder / 'profile'}", "--dump-dom", path.as_uri()]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-    return done.stdout, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
