@@ -55,7 +55,7 @@ class CaseRun:
 
         try:
             loaded = load_case(case).check()
-            if not loaded.parameters:
+            if not loaded.parameters and name == "infer":
                 raise ValueError(f"{case}: case.toml names no parameters to infer; add [[parameters]].")
             if loaded.model is None and name == "diagnose":
                 what = f"{case}: system {loaded.case.system} is a registered one"

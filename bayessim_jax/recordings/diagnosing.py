@@ -239,11 +239,12 @@ def diagnose_case(
         result = Diagnosis("no_mismatch", plain, none, [])
     else:
         with ThreadPoolExecutor(1) as pool:  # the residual force without a name is compiled and fitted beside
-            beside = pool.submit(_flexible, key, model, problem, windows, none)
+            scalar = any(kind in (2, 3) for _, kind, _, _ in model.case.layout.joints)
+            beside = pool.submit(_flexible, key, model, problem, windows, none) if scalar else None
             result = name_effects(key, problem, none, thresholds=thresholds, say=say)
             say("fitting a residual force without a name")
-            found = beside.result()
-        if result.verdict != "no_mismatch":
+            found = beside.result() if beside else None
+        if found and result.verdict != "no_mismatch":
             flexible, bench_flexible, places, shares, forces = found
     bench = result.bench
     scale = channel_scale(bench.shots)
@@ -354,11 +355,13 @@ def _locations(
     forces: dict[str, tuple[np.ndarray, ...]],
 ) -> list[Location]:
     """Joints by their share; what a verdict names stands under its own name."""
-    if result.verdict == "no_mismatch" or not places:
+    if result.verdict == "no_mismatch":
         return []
-    excess = result.baseline.misfit.excess.sum(1)[chosen]
+    every = np.maximum(result.baseline.misfit.excess[chosen], 0.0)
     names = [model.recordings[i].name for i in windows.recording[chosen]]
-    when = find_windows_of(excess, names, windows.start[chosen], model.case.case.horizon)
+    when = find_windows_of(every.sum(1), names, windows.start[chosen], model.case.case.horizon)
+    if not places:
+        return _by_channel(model, every.sum(0), when)
     named = {}
     if result.verdict == "explained":
         own = [name.partition("@")[2] for name in result.best.names]
@@ -374,6 +377,19 @@ def _locations(
     for location in found:
         location.share = round(location.share / total, 4)
     return sorted(found, key=lambda place: (place.at not in named.values(), -place.share))
+
+
+def _by_channel(
+    model: CaseModel, excess: Float[np.ndarray, " obs"], when: list[tuple[str, float, float]]
+) -> list[Location]:
+    """Shares of joints and sensors in the misfit of their channels, where no joint takes a residual force."""
+    shares: dict[str, float] = {}
+    for channel, part in zip(model.channels, excess / max(excess.sum(), 1e-12), strict=True):
+        kind, _, rest = channel.partition("/")
+        place = f"joint/{rest.split('/qpos')[0].split('/qvel')[0]}" if kind == "joint" else channel
+        shares[place] = shares.get(place, 0.0) + float(part)
+    ranked = sorted(shares.items(), key=lambda item: -item[1])
+    return [Location(place, round(share, 4), "everywhere", when) for place, share in ranked]
 
 
 def _joint_of(model: CaseModel, place: str) -> str:
