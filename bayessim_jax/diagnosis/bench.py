@@ -25,7 +25,7 @@ from bayessim_jax.inference.replay import Inputs, replay_window
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Fit, Shots, expand, solve
 from bayessim_jax.systems.mjcf import MjcfSystem
 
-__all__ = ["Bench", "Candidate", "Trial"]
+__all__ = ["SLOTS", "Bench", "Candidate"]
 
 NEAR = 0.1
 """Of the way from an effect's neutral value to where a fit usually begins: weak effects are found from there."""
@@ -57,16 +57,6 @@ class Tried:
     them: another case of the same model then finds the program in the compilation cache."""
     high: Float[Array, " e"]
     neutral: Float[Array, " e"]
-
-
-@dataclass(frozen=True)
-class Trial:
-    """A candidate that was fitted."""
-
-    candidate: Candidate
-    fit: Fit
-    log_likelihood: float
-    """Of the windows it was fitted to, at its own noise, initial states profiled out."""
 
 
 class Bench:
@@ -123,19 +113,25 @@ class Bench:
         """Whether it has no more parameters than there are places for."""
         return len(self.columns(candidate)) <= self.slots
 
-    def setup(self, candidate: Candidate, measured: Bool[Array, "windows rows obs"] | None = None) -> Shots:
-        """The windows with a candidate's parameters free; only what is `measured` counts."""
+    def setup(
+        self,
+        candidate: Candidate,
+        measured: Bool[Array, "windows rows obs"] | None = None,
+        shots: Shots | None = None,
+    ) -> Shots:
+        """The windows (or others) with a candidate's parameters free; only what is `measured` counts."""
+        every = self.shots if shots is None else shots
         columns = self.columns(candidate)
         unused = self.d + len(self.parameters)
         index = np.concatenate([np.arange(self.d), self.d + np.array(columns, int)])
         index = np.concatenate([index, np.full(self.size - len(index), unused)]).astype(int)
         on = np.isin(np.arange(len(self.parameters)), columns)
-        windows = self.shots.y.shape[0]
+        windows = every.y.shape[0]
         shared = (index, on, [m.a for m in self.each], [m.b for m in self.each], self.neutral)
         arrays = (jnp.asarray(x) for x in (*shared[:2], *(np.asarray(x, float) for x in shared[2:])))
-        inputs = Tried(self.shots.inputs, *(jnp.broadcast_to(x, (windows, x.size)) for x in arrays))
-        mask = self.shots.measured if measured is None else measured
-        return dataclasses.replace(self.shots, inputs=inputs, measured=mask)
+        inputs = Tried(every.inputs, *(jnp.broadcast_to(x, (windows, x.size)) for x in arrays))
+        mask = every.measured if measured is None else measured
+        return dataclasses.replace(every, inputs=inputs, measured=mask)
 
     def starts(self, candidate: Candidate, z: Float[Array, " d"]) -> list[Float[Array, " k"]]:
         """Points to begin from: θ as given, the effects a little off neutral, at their start values, and mirrored."""
@@ -200,6 +196,13 @@ class Bench:
         shots = self.setup(candidate, measured)
         return solve(self.predict, shots, x, delta, sigma, free, steps=jnp.asarray(steps), step=self.step)
 
+    def replay(
+        self, candidate: Candidate, x: Float[Array, " k"], shots: Shots, delta: Float[Array, " n"] | float = 0.0
+    ) -> Float[np.ndarray, "windows rows obs"]:
+        """Predictions of windows from their recorded initial states, or from beside them."""
+        still = jnp.broadcast_to(delta, (shots.y.shape[0], shots.spread.size))
+        return np.asarray(_replay(self.predict, x, still, self.setup(candidate, shots=shots).inputs))
+
     def look(self, candidate: Candidate, fit: Fit, measured: Bool[Array, "windows rows obs"]) -> tuple[Array, Array]:
         """Residuals in the channels' units, and the derivatives of predictions along the initial states over S."""
         shots = self.setup(candidate, measured)
@@ -219,3 +222,8 @@ def _look(predict: Any, shots: Shots, x: Array, delta: Array, step: float) -> tu
     ones = jnp.ones(shots.y.shape[-1])
     r, slopes = expand(states, shots, jnp.zeros(0), delta, ones, step)
     return r.reshape(shots.y.shape), slopes
+
+
+@partial(jax.jit, static_argnames="predict", compiler_options=COMPILER_OPTIONS)
+def _replay(predict: Any, x: Array, delta: Array, inputs: Tried) -> Array:
+    return jax.vmap(predict, in_axes=(None, 0, 0))(x, delta, inputs)

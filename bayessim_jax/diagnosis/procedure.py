@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,13 +14,15 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bayessim_jax.beliefs.margins import Margins
 from bayessim_jax.diagnosis.bench import SLOTS, Bench, Candidate
+from bayessim_jax.diagnosis.response import Motion
+from bayessim_jax.diagnosis.screen import Screen, Screened
 from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, Misfit, judge_misfit
-from bayessim_jax.effects import Scales, at
+from bayessim_jax.effects import Scales
 from bayessim_jax.inference.direct import noise_floor
 from bayessim_jax.inference.shooting import Fit, Shots
 from bayessim_jax.systems.mjcf import MjcfSystem
 
-__all__ = ["CONTAINS", "Diagnosis", "Entry", "Problem", "Thresholds", "detect", "enter", "name_effects", "share_left"]
+__all__ = ["CONTAINS", "Diagnosis", "Entry", "Problem", "Thresholds", "detect", "name_effects", "share_left"]
 
 CONTAINS = {
     "stribeck_friction": ("coulomb_friction",),
@@ -34,21 +36,27 @@ CONTAINS = {
 """Effects that have others as special cases: where both do as well, the simpler one is the finding."""
 
 
-SCREENED, STEPS = 16, 5
-"""Windows and solver steps with which every candidate is tried at first."""
-HEAVY = frozenset({"sensor_delay", "hysteresis"})
-"""Effects that cost several times what the others do: they are tried on a bench of their own."""
-FINALISTS, LEADERS, PAIRS = 10, 3, 4
-"""Effects that are fitted to the end, those of them whose relatives are too, and pairs."""
-WORTH = 0.3
-"""Share of the best effect's first gain from which another is fitted to the end by itself, not in pairs alone."""
+SCREENED = 60
+"""Windows with which every candidate is tried at first."""
+FINALISTS, LEADERS, PAIRS = 7, 2, 4
+"""Single effects that are simulated at most, at least, and pairs."""
+GLANCED = 4
+"""Partners of a leader that are fitted to the end."""
+WORTH = 0.5
+"""Share of the best effect's gain from which another is simulated."""
+LOST, MOST_LOST = 25.0, 0.15
+"""A window whose misfit is so many times the median one cannot be followed, as long as no more than a share are so."""
+TRIMMED = 0.05
+"""Share of windows that do not count for what a candidate leaves."""
+DOUBT = 0.05
+"""Probability that a model fails in a window, where the simulator without effects then predicts."""
 FOLDS = 4
 """Groups of recordings, each scored by fits to the others."""
 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """What decides; set on made-up worlds by `scripts/set_thresholds.py`, with whole families of effects left out."""
+    """What decides."""
 
     negligible: float = 0.02
     """Share of the baseline's residual variance: what a candidate that removes less is not worth."""
@@ -70,8 +78,8 @@ class Entry:
     scores: Float[np.ndarray, " windows"]
     """Log predictive density of every window, its initial state profiled out."""
     misfit: Misfit
-    variance: Float[np.ndarray, " obs"]
-    """Of held-out residuals."""
+    squares: Float[np.ndarray, "windows obs"]
+    """Mean squares of residuals that the fit has not seen."""
 
     @property
     def score(self) -> float:
@@ -106,42 +114,46 @@ class _Work:
     key: PRNGKeyArray
     bench: Bench
     group: Int[np.ndarray, " windows"]
-    chosen: Bool[np.ndarray, " windows"]
     floor: Array
     say: Callable[[str], None]
+    numbers: tuple[int, ...] = ()
+    """Of the problem's pairs, those on the bench."""
 
-    def mask(self, which: Bool[np.ndarray, " windows"]) -> Array:
+    def mask(self, which: Bool[np.ndarray, " windows"] | slice = slice(None)) -> Array:
         """What was measured in some of the windows."""
-        return self.bench.shots.measured & jnp.asarray(which)[:, None, None]
+        chosen = np.zeros(len(self.group), bool)
+        chosen[which] = True
+        return self.bench.shots.measured & jnp.asarray(chosen)[:, None, None]
 
-    def noise(self, squares: np.ndarray, which: np.ndarray, fitted: int) -> Array:
-        """Noise from the squared residuals of some windows."""
-        measured = np.asarray(self.bench.shots.measured)[which]
-        counts = measured.sum((0, 1))
-        states = self.bench.shots.spread.size * which.sum()
+    def noise(self, r: np.ndarray, kept: np.ndarray, fitted: int) -> Array:
+        """Noise from the residuals of some windows."""
+        counts = np.asarray(self.bench.shots.measured)[kept].sum((0, 1))
+        states = self.bench.shots.spread.size * kept.sum()
         share = max(1.0 - (fitted + states) / max(counts.sum(), 1), 0.2)
-        sigma = np.sqrt(squares[which].sum(0) / np.maximum(counts * share, 1))
+        sigma = np.sqrt((r[kept] ** 2).sum((0, 1)) / np.maximum(counts * share, 1))
         return jnp.maximum(jnp.asarray(sigma), self.floor)
 
-    def settle(self, candidate: Candidate, fit: Fit, which: np.ndarray, rounds: int = 4, steps: int = 12) -> Fit:
+    def followed(self, r: np.ndarray, sigma: Array, which: np.ndarray) -> np.ndarray:
+        """Those of some windows that a fit can follow: stick-slip and falling over are chaotic, and a few are lost."""
+        counts = np.maximum(np.asarray(self.bench.shots.measured).sum((1, 2)), 1)
+        size = np.nan_to_num(((r / np.asarray(sigma)) ** 2).sum((1, 2)) / counts, nan=np.inf)
+        lost = which & (size > LOST * np.median(size[which]))
+        return which & ~lost if lost.sum() <= MOST_LOST * which.sum() else which
+
+    def settle(
+        self, candidate: Candidate, fit: Fit, which: Bool[np.ndarray, " windows"], rounds: int = 4, steps: int = 12
+    ) -> Fit:
         """Fit a candidate and its noise in turn."""
-        mask = self.mask(which)
         free = self.bench.d + len(self.bench.columns(candidate))
         for _ in range(rounds):
-            squares = np.asarray((self.bench.look(candidate, fit, mask)[0] ** 2).sum(1))
-            sigma = self.noise(squares, which, free)
+            r = np.asarray(self.bench.look(candidate, fit, self.mask())[0])
+            kept = self.followed(r, fit.sigma, which)
+            sigma = self.noise(r, kept, free)
             change = float(jnp.abs(jnp.log(sigma / fit.sigma)).max())
-            fit = self.bench.fit(candidate, fit.z, fit.delta, sigma, mask, steps=steps)
+            fit = self.bench.fit(candidate, fit.z, fit.delta, sigma, self.mask(kept), steps=steps)
             if change < 0.03:
                 break
         return fit
-
-    def likelihood(self, candidate: Candidate, fit: Fit, which: np.ndarray) -> float:
-        """Log likelihood at the fit's own noise, up to a constant."""
-        squares = np.asarray((self.bench.look(candidate, fit, self.mask(which))[0] ** 2).sum((0, 1)))
-        counts = np.asarray(self.bench.shots.measured)[which].sum((0, 1))
-        variance = np.maximum(squares / np.maximum(counts, 1), np.asarray(self.floor) ** 2)
-        return float(-0.5 * (counts * np.log(variance)).sum())
 
 
 @dataclass(frozen=True)
@@ -156,64 +168,83 @@ class Problem:
     shots: Shots
     group: Int[np.ndarray, " windows"]
     """The recording of each window."""
-    chosen: Bool[np.ndarray, " windows"]
-    """Windows that choose; the others are never looked at."""
+    motion: Motion
+    """The smoothed motion in the same windows."""
     step: float = 0.0
 
-    def bench(self, pairs: Sequence[tuple[Any, str]], which: Any = slice(None), slots: int = SLOTS) -> Bench:
-        """A bench for some of the pairs, with some of the windows."""
-        shots = dataclasses.replace(
-            self.shots,
-            inputs=jax.tree.map(lambda x: x[which], self.shots.inputs),
-            y=self.shots.y[which],
-            measured=self.shots.measured[which],
-        )
-        return Bench(self.system, self.margins, pairs, self.scales, shots, self.step, slots)
+    def screen(self, pairs: Sequence[tuple[Any, str]], slots: int = SLOTS) -> Screen:
+        """Pairs to be held against some of the windows."""
+        count = len(self.group)
+        rows = np.unique(np.linspace(0, count - 1, min(SCREENED, count)).astype(int))
+        motion = jax.tree.map(lambda x: x[rows], self.motion)
+        shots = dataclasses.replace(self.shots, inputs=None, y=self.shots.y[rows], measured=self.shots.measured[rows])
+        group = self.group[rows]
+        labels = sorted(set(group.tolist()))
+        folds = np.array([np.isin(group, labels[i::FOLDS]) for i in range(min(FOLDS, len(labels)))])
+        return Screen(self.system, self.margins, pairs, self.scales, shots, motion, folds, self.step, slots)
+
+    def bench(self, pairs: Sequence[tuple[Any, str]], slots: int = SLOTS) -> Bench:
+        """A bench for some of the pairs."""
+        return Bench(self.system, self.margins, pairs, self.scales, self.shots, self.step, slots)
 
 
-def detect(key: PRNGKeyArray, problem: Problem, baseline: Fit, folds: int = FOLDS) -> tuple[Bench, Entry]:
-    """The simulator without effects: fitted, scored across recordings, and tested for a mismatch.
-
-    `baseline` is its fit to the problem's windows, where this begins.
-    """
+def detect(key: PRNGKeyArray, problem: Problem, baseline: Fit) -> tuple[Bench, Entry]:
+    """The simulator without effects, tested for a mismatch from its fit to the problem's windows."""
     nothing, bench = Candidate(), problem.bench(())
-    work = _Work(key, bench, problem.group, problem.chosen, noise_floor(bench.shots), _quiet)
+    work = _Work(key, bench, problem.group, noise_floor(bench.shots), _quiet)
     x = bench.starts(nothing, baseline.z)[0]
-    fit = bench.fit(nothing, x, baseline.delta, baseline.sigma, work.mask(problem.chosen), steps=8)
-    return bench, _enter(work, nothing, work.settle(nothing, fit, problem.chosen), folds)
+    fit = bench.fit(nothing, x, baseline.delta, baseline.sigma, work.mask(), steps=8)
+    return bench, _enter(work, nothing, work.settle(nothing, fit, np.ones(len(problem.group), bool)))
 
 
 def name_effects(
     key: PRNGKeyArray,
     problem: Problem,
-    none: Entry,
+    detected: Entry,
     *,
     thresholds: Thresholds | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Diagnosis:
     """Find what a simulator lacks whose misfit was detected.
 
-    First every effect at every place, a few steps each on a part of the windows, on one bench that holds them all;
-    then the best of them on a bench of their own, to the end, and in pairs where one is not enough.
+    First every effect at every place along the recorded motion (`diagnosis.screen`); then the best of them are
+    simulated on a bench of their own, and pairs where one is not enough.
     """
     thresholds = thresholds or Thresholds()
-    say(f"trying {len(problem.pairs)} candidates; compiling takes a while")
-    ranked = _screen(problem, none.fit, say)
-    order, gains = [k for k, _ in ranked], dict(ranked)
-    leaders = order[:LEADERS]
-    kept = [k for i, k in enumerate(order) if i < FINALISTS or any(_are_kin(problem, k, j) for j in leaders)]
-    worthy = [k for k in kept if gains[k] > WORTH * gains[order[0]] or any(_are_kin(problem, k, j) for j in leaders)]
-    bench = problem.bench([problem.pairs[k] for k in kept])
-    work = _Work(key, bench, problem.group, problem.chosen, noise_floor(bench.shots), say)
-    entries = _finish(work, none.fit, [Candidate((kept.index(k),)) for k in dict.fromkeys([*leaders, *worthy])], FOLDS)
-    if entries and share_left(entries[0], none) > thresholds.left:
-        entries = _extend(work, entries, FOLDS)
-    listed = [(f"{problem.pairs[k][0].name}@{at(problem.pairs[k][1])}", gain) for k, gain in ranked]
+    screen, start = problem.screen(problem.pairs), detected.fit
+    say(f"holding {len(problem.pairs)} candidates against the recorded motion")
+    nothing = screen.begin(start.z[: screen.d], start.sigma)
+    random = np.random.default_rng(0)
+    ranked = _rank(screen, nothing, random, say)
+    if not ranked:
+        return Diagnosis("unexplained", *detect(key, problem, _still(problem, start)), [])
+    singles = _finalists(problem, nothing, ranked)
+    work = _bench_of(key, problem, singles, say)
+    none = _without(work, problem, detected)
+    entries = _finish(work, none, singles)
+    if not entries or share_left(entries[0].misfit, none.misfit) > thresholds.left:
+        say("one effect is not enough: trying pairs")
+        pairs = _pair(screen, ranked, random)[:PAIRS]
+        alone = {k for pair in pairs for k in pair.candidate.effects}
+        best = {work.numbers[k] for entry in entries[:2] for k in entry.candidate.effects}
+        kept = [*pairs, *(found for found in ranked if found.candidate.effects[0] in alone | best)]
+        work = _bench_of(key, problem, kept, say)
+        none = _without(work, problem, detected)
+        entries = _finish(work, none, kept)
+    listed = [(screen.name(found.candidate), found.score - nothing.score) for found in ranked]
     return _decide(work, none, entries, listed, thresholds)
 
 
 def _quiet(text: str) -> None:
     """Say nothing."""
+
+
+def _bench_of(key: PRNGKeyArray, problem: Problem, candidates: Sequence[Screened], say: Callable[[str], None]) -> _Work:
+    """A bench with the effects of some candidates."""
+    numbers = sorted({k for found in candidates for k in found.candidate.effects})
+    bench = problem.bench([problem.pairs[k] for k in numbers])
+    say(f"simulating {len(candidates)} candidates; compiling takes a while")
+    return _Work(key, bench, problem.group, noise_floor(bench.shots), say, tuple(numbers))
 
 
 def _are_kin(problem: Problem, one: int, other: int) -> bool:
@@ -223,115 +254,93 @@ def _are_kin(problem: Problem, one: int, other: int) -> bool:
     return kin and place == where
 
 
-def _screen(problem: Problem, start: Fit, say: Callable[[str], None]) -> list[tuple[int, float]]:
-    """Every pair and what it lowers the cost by in a few steps, the best first."""
-    rows = np.flatnonzero(problem.chosen)
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, SCREENED).astype(int))]
-    groups = [
-        [k for k, (effect, _) in enumerate(problem.pairs) if (effect.name in HEAVY) == heavy] for heavy in (False, True)
+def _rank(screen: Screen, nothing: Screened, random: np.random.Generator, say: Callable[[str], None]) -> list[Screened]:
+    """Every single effect, the best first."""
+    found = []
+    for k in range(len(screen.pairs)):
+        candidate = Candidate((k,))
+        tried = screen.try_candidate(candidate, nothing, random) if screen.takes(candidate) else None
+        if tried is not None and np.isfinite(tried.score):
+            found.append(tried)
+        if k % 40 == 39:
+            say(f"{k + 1} of {len(screen.pairs)}")
+    return sorted(found, key=lambda item: -item.score)
+
+
+def _finalists(problem: Problem, nothing: Screened, ranked: Sequence[Screened]) -> list[Screened]:
+    """The best single effects, those that come near them, and relatives of the first."""
+    best = ranked[0].score - nothing.score
+    first = ranked[0].candidate.effects[0]
+    return [
+        found
+        for i, found in enumerate(ranked)
+        if i < LEADERS
+        or (i < FINALISTS and found.score - nothing.score > WORTH * best)
+        or _are_kin(problem, found.candidate.effects[0], first)
     ]
-    with ThreadPoolExecutor(len(groups)) as pool:  # each compiles a program of its own
-        parts = pool.map(lambda numbers: _screen_group(problem, start, rows, numbers, say), groups)
-        found = [item for part in parts for item in part]
-    return sorted(found, key=lambda item: -item[1])
 
 
-def _screen_group(
-    problem: Problem, start: Fit, rows: np.ndarray, numbers: Sequence[int], say: Callable[[str], None]
-) -> list[tuple[int, float]]:
-    """Some of the pairs, on one bench."""
-    if not numbers:
-        return []
-    nothing, found = Candidate(), []
-    bench = problem.bench([problem.pairs[k] for k in numbers], rows)
-    delta, mask = start.delta[rows], bench.shots.measured
-    before = bench.fit(nothing, bench.starts(nothing, start.z[: bench.d])[0], delta, start.sigma, mask, steps=3)
-    for i, k in enumerate(numbers):
-        candidate = Candidate((i,))
-        if not bench.fits(candidate):
-            continue
-        costs = [
-            float(bench.fit(candidate, x, before.delta, start.sigma, mask, steps=STEPS).cost)
-            for x in bench.starts(candidate, start.z[: bench.d])
-        ]
-        costs = [cost for cost in costs if np.isfinite(cost)]
-        if costs:
-            found.append((k, float(before.cost) - min(costs)))
-        if i % 20 == 19:
-            say(f"tried {i + 1} of {len(numbers)}")
-    return found
-
-
-def _fit(work: _Work, candidate: Candidate, start: Fit, known: Fit | None = None, own: Candidate | None = None) -> Any:
-    """The best fit from a candidate's starts, with `known` values for the effects of `own`."""
-    bench, mask, best = work.bench, work.mask(work.chosen), None
-    for x in bench.starts(candidate, start.z[: bench.d]):
-        if known is not None and own is not None:
-            columns = bench.columns(candidate)
-            for j, column in enumerate(bench.columns(own)):
-                x = x.at[bench.d + columns.index(column)].set(known.z[bench.d + j])
-        fit = bench.fit(candidate, x, start.delta, start.sigma, mask, steps=12)
-        if np.isfinite(float(fit.cost)) and (best is None or float(fit.cost) < float(best.cost)):
-            best = fit
-    return best
-
-
-def _finish(work: _Work, start: Fit, candidates: Sequence[Candidate], folds: int) -> list[Entry]:
-    """Candidates, fitted to the end and scored across recordings, best first."""
-    entries = []
-    for candidate in candidates:
-        fit = _fit(work, candidate, start)
-        if fit is not None:
-            entries.append(_enter(work, candidate, work.settle(candidate, fit, work.chosen), folds))
-            work.say(f"{' + '.join(entries[-1].names)}: score {entries[-1].score:.1f}")
-    return sorted(entries, key=lambda entry: -entry.score)
-
-
-def _extend(work: _Work, entries: list[Entry], folds: int) -> list[Entry]:
-    """Pairs of the best effects with every other one on the bench."""
-    bench, found, seen = work.bench, [], set()
-    for entry in entries[:2]:
-        for k in range(len(bench.pairs)):
-            pair = entry.candidate + Candidate((k,))
-            if pair in seen or len(pair.effects) < 2 or not bench.fits(pair):
+def _pair(screen: Screen, ranked: Sequence[Screened], random: np.random.Generator) -> list[Screened]:
+    """Pairs of the best single effects with every other one, the best first."""
+    found, seen = [], set()
+    for known in ranked[:LEADERS]:
+        first = []
+        for k in range(len(screen.pairs)):
+            pair = known.candidate + Candidate((k,))
+            if len(pair.effects) < 2 or pair in seen or not screen.takes(pair):
                 continue
             seen.add(pair)
-            fit = _fit(work, pair, entry.fit, entry.fit, entry.candidate)
-            if fit is not None:
-                fit = work.settle(pair, fit, work.chosen, rounds=1, steps=6)
-                found.append((pair, fit, work.likelihood(pair, fit, work.chosen)))
-    work.say(f"tried {len(found)} pairs")
-    found.sort(key=lambda item: -item[2] + len(bench.columns(item[0])))
-    for pair, fit, _ in found[:PAIRS]:
-        entries.append(_enter(work, pair, work.settle(pair, fit, work.chosen), folds))
-        work.say(f"{' + '.join(entries[-1].names)}: score {entries[-1].score:.1f}")
+            cost = screen.glance(pair, known)
+            if np.isfinite(cost):
+                first.append((cost, pair))
+        first.sort(key=lambda item: item[0])
+        tried = [screen.try_candidate(pair, known, random) for _, pair in first[:GLANCED]]
+        found += [t for t in tried if t is not None and np.isfinite(t.score)]
+    return sorted(found, key=lambda item: -item.score)
+
+
+def _still(problem: Problem, fit: Fit) -> Fit:
+    """A fit to other windows as where a fit to a problem's windows begins."""
+    return dataclasses.replace(fit, delta=jnp.zeros((len(problem.group), fit.delta.shape[-1])))
+
+
+def _without(work: _Work, problem: Problem, detected: Entry) -> Entry:
+    """The simulator without effects on a bench that holds some; its fit and test are the ones of whole windows."""
+    nothing, start = Candidate(), _still(problem, detected.fit)
+    x = work.bench.starts(nothing, start.z[: work.bench.d])[0]
+    fit = work.bench.fit(nothing, x, start.delta, start.sigma, work.mask(), steps=12)
+    entry = _enter(work, nothing, work.settle(nothing, fit, np.ones(len(work.group), bool)))
+    entry.misfit = dataclasses.replace(entry.misfit, p_value=detected.misfit.p_value)
+    entry.fit = dataclasses.replace(fit, z=x.at[: work.bench.d].set(start.z[: work.bench.d]))
+    return entry
+
+
+def _finish(work: _Work, none: Entry, candidates: Sequence[Screened]) -> list[Entry]:
+    """Candidates simulated and fitted from where the screen found them, and scored across recordings, best first."""
+    entries, bench = [], work.bench
+    every = np.ones(len(work.group), bool)
+    for found in candidates:
+        own = Candidate(tuple(work.numbers.index(k) for k in found.candidate.effects))
+        delta, sigma = jnp.zeros_like(none.fit.delta), jnp.maximum(found.sigma, work.floor)
+        fit = bench.fit(own, found.p, delta, sigma, work.mask(), steps=12)
+        if np.isfinite(float(fit.cost)):
+            entry = _enter(work, own, work.settle(own, fit, every))
+            entry.scores = np.logaddexp(np.log1p(-DOUBT) + entry.scores, np.log(DOUBT) + none.scores)
+            entries.append(entry)
+            work.say(f"{' + '.join(entry.names)}: score {entry.score:.1f}")
     return sorted(entries, key=lambda entry: -entry.score)
 
 
-def enter(key: PRNGKeyArray, problem: Problem, bench: Bench, candidate: Candidate, start: Fit, folds: int = 2) -> Entry:
-    """Fit one candidate of another bench from a baseline's fit, and score it as all candidates are."""
-    chosen = problem.chosen
-    work = _Work(key, bench, problem.group, chosen, noise_floor(bench.shots), _quiet)
-    x = bench.starts(Candidate(), start.z[: bench.d])[0]
-    fit = bench.fit(candidate, x, start.delta, start.sigma, work.mask(chosen), steps=10)
-    return _enter(work, candidate, work.settle(candidate, fit, chosen, rounds=3, steps=8), folds)
-
-
-def _enter(work: _Work, candidate: Candidate, fit: Fit, folds: int) -> Entry:
+def _enter(work: _Work, candidate: Candidate, fit: Fit, folds: int = FOLDS) -> Entry:
     """Score a candidate on windows that its fit has not seen, recording by recording or in as many folds."""
-    bench, chosen = work.bench, work.chosen
-    labels = sorted(set(work.group[chosen].tolist()))
-    units = work.group if len(labels) > 1 else np.arange(len(work.group))
-    labels = sorted(set(units[chosen].tolist()))
-    parts = [labels[i::folds] for i in range(min(folds, len(labels)))]
+    bench, group = work.bench, work.group
+    units = group if len(set(group.tolist())) > 1 else np.arange(len(group))
+    labels = sorted(set(units.tolist()))
     measured = np.asarray(bench.shots.measured)
-    scores = np.zeros(len(chosen))
-    left = np.zeros(measured.shape)
-    for part in parts:
-        out = chosen & np.isin(units, part)
-        kept = chosen & ~out
-        if not kept.any():
-            kept = chosen
+    scores, left = np.zeros(len(group)), np.zeros(measured.shape)
+    for part in [labels[i::folds] for i in range(min(folds, len(labels)))]:
+        out = np.isin(units, part)
+        kept = ~out if not out.all() else out
         trained = work.settle(candidate, fit, kept, rounds=1, steps=6)
         judged = bench.fit(candidate, trained.z, fit.delta, trained.sigma, work.mask(out), steps=6, only_states=True)
         r = np.asarray(bench.look(candidate, judged, work.mask(out))[0])
@@ -341,20 +350,22 @@ def _enter(work: _Work, candidate: Candidate, fit: Fit, folds: int) -> Entry:
         scores = np.where(out, logs.sum((1, 2)), scores)
         left = np.where(out[:, None, None], r, left)
     misfit_key = jax.random.fold_in(work.key, sum(2**k for k in candidate.effects) % (2**31))
-    mask = work.mask(chosen)
-    residual, slopes = bench.look(candidate, fit, mask)
-    misfit = judge_misfit(misfit_key, np.asarray(residual), slopes, np.asarray(mask))
-    counts = measured[chosen].sum((0, 1))
-    variance = (np.where(measured, left, 0.0)[chosen] ** 2).sum((0, 1)) / np.maximum(counts, 1)
-    return Entry(candidate, bench.names(candidate), fit, scores, misfit, variance)
+    residual, slopes = bench.look(candidate, fit, work.mask())
+    misfit = judge_misfit(misfit_key, np.asarray(residual), slopes, measured)
+    sizes = (np.where(measured, left, 0.0) ** 2).sum(1) / np.maximum(measured.sum(1), 1)
+    return Entry(candidate, bench.names(candidate), fit, scores, misfit, sizes)
 
 
-def share_left(entry: Entry, none: Entry) -> float:
-    """Share of the baseline's misfit that a candidate leaves, both in units of the smaller noise."""
-    noise = np.minimum(entry.misfit.noise, none.misfit.noise)
-    own = (entry.misfit.excess * (entry.misfit.noise / noise) ** 2).sum()
-    before = (none.misfit.excess * (none.misfit.noise / noise) ** 2).sum()
-    return float(max(own, 0.0) / max(before, 1e-12))
+def share_left(after: Misfit, before: Misfit) -> float:
+    """Share of a misfit that a candidate leaves, both in units of the smaller noise.
+
+    The few windows that it leaves most in are left out of both: where motion is chaotic nothing is explained.
+    """
+    noise = np.minimum(after.noise, before.noise)
+    own = (after.excess * (after.noise / noise) ** 2).sum(1)
+    was = (before.excess * (before.noise / noise) ** 2).sum(1)
+    kept = np.argsort(own)[: max(len(own) - int(TRIMMED * len(own)), 1)]
+    return float(max(own[kept].sum(), 0.0) / max(was[kept].sum(), 1e-12))
 
 
 def _decide(
@@ -365,15 +376,18 @@ def _decide(
     if not entries:
         return result
     best = entries[0]
-    removed = 1 - float((best.variance / np.maximum(none.variance, 1e-300)).min())
+    kept = np.argsort(best.squares.sum(1))[: max(round((1 - TRIMMED) * len(best.squares)), 1)]
+    removed = 1 - float((best.squares[kept].sum(0) / np.maximum(none.squares[kept].sum(0), 1e-300)).min())
     if removed < thresholds.negligible or best.score - none.score < thresholds.least:
         result.verdict = "no_mismatch"
         return result
-    tied = [entry for entry in entries if _ties(entry, best, work.chosen, thresholds)]
+    tied = [entry for entry in entries if _ties(entry, best, thresholds)]
     fewest = min(len(entry.candidate.effects) for entry in tied)
     tied = [entry for entry in tied if len(entry.candidate.effects) == fewest]
     tied = [entry for entry in tied if not _contains_another(entry, tied)]
-    explaining = [e for e in tied if share_left(e, none) <= thresholds.left or e.misfit.p_value >= FALSE_ALARMS]
+    explaining = [
+        e for e in tied if share_left(e.misfit, none.misfit) <= thresholds.left or e.misfit.p_value >= FALSE_ALARMS
+    ]
     if not explaining:
         return result
     result.confusion = sorted(explaining, key=lambda e: (len(work.bench.columns(e.candidate)), -e.score))
@@ -381,15 +395,9 @@ def _decide(
     return result
 
 
-def _ties(entry: Entry, best: Entry, chosen: np.ndarray, thresholds: Thresholds) -> bool:
-    """Whether a candidate predicts held-out windows as well as the best one, within the error of the difference.
-
-    Differences beyond three times their median are cut there: one window that a candidate cannot follow at all says no
-    more against it than any other that it cannot follow.
-    """
-    difference = (best.scores - entry.scores)[chosen]
-    most = 3 * max(float(np.median(np.abs(difference))), 1e-9)
-    difference = np.clip(difference, -most, most)
+def _ties(entry: Entry, best: Entry, thresholds: Thresholds) -> bool:
+    """Whether a candidate predicts held-out windows as well as the best one, within the error of the difference."""
+    difference = best.scores - entry.scores
     error = difference.std(ddof=1) * np.sqrt(len(difference)) if len(difference) > 1 else 0.0
     return float(difference.sum()) <= max(thresholds.tie * error, thresholds.least)
 

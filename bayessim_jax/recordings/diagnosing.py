@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from bayessim_jax.diagnosis.bench import Bench, Candidate
 from bayessim_jax.diagnosis.flexible import FEATURES, FlexibleForce, features
@@ -22,24 +21,26 @@ from bayessim_jax.diagnosis.procedure import (
     Problem,
     Thresholds,
     detect,
-    enter,
     name_effects,
     share_left,
 )
+from bayessim_jax.diagnosis.response import Motion
+from bayessim_jax.diagnosis.screen import Screened
 from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS
 from bayessim_jax.effects import EFFECTS, Scales, effect_places, recorded_scales
 from bayessim_jax.inference.scores import Score, compare, error_spread, score
-from bayessim_jax.inference.shooting import Fit
+from bayessim_jax.inference.shooting import Fit, Shots
 from bayessim_jax.recordings.identification import channel_scale, settle_step, start_spread
 from bayessim_jax.recordings.shots import CaseModel, split_windows, take
-from bayessim_jax.recordings.windows import Windows
+from bayessim_jax.recordings.smoothing import smooth_recordings
+from bayessim_jax.recordings.windows import Windows, cut_windows
 
-__all__ = ["CaseDiagnosis", "case_problem", "diagnose_case"]
+__all__ = ["CaseDiagnosis", "diagnose_case"]
 
 MOST_FITTED, MOST_HELD = 44, 20
 """Windows that choose and windows that judge; of longer recordings they are spread evenly."""
-BEFORE = 0.1
-"""Seconds of commands before a window that a delay may look back on."""
+PIECE, LEAST = 0.16, 16
+"""s and rows: naming is done with pieces of windows of about this length. Stick-slip makes longer ones chaotic."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +50,14 @@ class CaseDiagnosis:
     model: CaseModel
     bench: Bench
     windows: Windows
-    chosen: np.ndarray
+    """Those that choose and those that judge, each as long as the horizon."""
+    chosen: Bool[np.ndarray, " windows"]
+    shots: Shots
+    """The same as the solver takes them."""
+    pieces: Windows
+    """What the entries' misfits are of: pieces of the windows that choose, or these themselves."""
     result: Diagnosis
-    flexible: Entry | None
+    flexible: Screened | None
     flexible_bench: Bench | None
     locations: list[Location]
     scores: dict[str, Score]
@@ -68,7 +74,7 @@ class CaseDiagnosis:
     @property
     def shares_left(self) -> list[float]:
         """Share of the misfit that every finalist leaves."""
-        return [share_left(entry, self.result.baseline) for entry in self.result.entries]
+        return [share_left(entry.misfit, self.result.baseline.misfit) for entry in self.result.entries]
 
     @property
     def held_out(self) -> list[str]:
@@ -171,32 +177,57 @@ def _thin(windows: Windows, most: int) -> Windows:
     return windows if count <= most else take(windows, np.unique(np.linspace(0, count - 1, most).astype(int)))
 
 
-def case_problem(
-    key: Array, model: CaseModel, *, say: Callable[[str], None] = lambda text: None
-) -> tuple[CaseModel, Problem, Windows, Fit]:
-    """A case as the diagnosis takes it, with every registered effect at every place, and the fit without effects.
+@dataclass(frozen=True)
+class _Taken:
+    """A case as the diagnosis takes it."""
 
-    The windows that choose come first.
-    """
-    fitted, held = split_windows(model)
-    fitted, held = _thin(fitted, MOST_FITTED), _thin(held, MOST_HELD)
+    model: CaseModel
+    windows: Windows
+    chosen: Bool[np.ndarray, " windows"]
+    pieces: Windows
+    whole: Problem
+    """Windows as long as the horizon, by which a mismatch is detected."""
+    problem: Problem
+    """Pieces of them, by which it is named."""
+    baseline: Fit
+
+
+def _take_case(key: Array, model: CaseModel, *, say: Callable[[str], None] = lambda text: None) -> _Taken:
+    """Windows, smoothed motion, every registered effect at every place, and the fit without effects."""
+    split = [_thin(part, most) for part, most in zip(split_windows(model), (MOST_FITTED, MOST_HELD), strict=True)]
+    fitted, held = split
     model, fit = settle_step(key, model, fitted, say=say)
     windows = join(fitted, held)
     system: Any = model.system
     pairs = tuple((effect, place) for effect in EFFECTS.values() for place in effect_places(effect, system))
     joints = [f"joint/{name}" for name, kind, *_ in model.case.layout.joints if kind in (2, 3)]
-    problem = Problem(
+    rows = max(round(PIECE / model.system.dt), LEAST)
+    smooth = _smoothed(model)
+    pieces = cut_windows(fitted, rows)
+    whole = Problem(
         system=system,
         margins=model.margins,
         pairs=pairs,
         scales=_scales(model, [*(place for _, place in pairs), *joints]),
-        shots=model.shots(windows),
-        group=windows.recording,
-        chosen=np.arange(len(windows)) < len(fitted),
+        shots=model.shots(fitted),
+        group=fitted.recording,
+        motion=_motion(model, pieces, cut_windows(_thin(split_windows(smooth)[0], MOST_FITTED), rows)),
         step=model.step,
     )
-    delta = jnp.concatenate([fit.delta, jnp.zeros((len(held), fit.delta.shape[1]))])
-    return model, problem, windows, dataclasses.replace(fit, delta=delta)
+    problem = dataclasses.replace(whole, shots=model.shots(pieces), group=pieces.recording)
+    return _Taken(model, windows, np.arange(len(windows)) < len(fitted), pieces, whole, problem, fit)
+
+
+def _motion(model: CaseModel, windows: Windows, smooth: Windows) -> Motion:
+    """The smoothed motion in windows, with their commands."""
+    inputs = model.inputs(windows)
+    return Motion(jnp.asarray(smooth.qpos), jnp.asarray(smooth.qvel), inputs.ctrl, inputs.past, inputs.time)
+
+
+def _smoothed(model: CaseModel) -> CaseModel:
+    """The same case with smoothed motion."""
+    joints = [(q, v) for _, kind, q, v in model.case.layout.joints if kind in (2, 3)]
+    return dataclasses.replace(model, recordings=smooth_recordings(model.recordings, joints))
 
 
 def _scales(model: CaseModel, places: Sequence[str]) -> dict[str, Scales]:
@@ -229,109 +260,112 @@ def diagnose_case(
     """Diagnose a case; raises `ValueError` where nothing can be simulated."""
     fit_key, key = jax.random.split(key)
     say("fitting the simulator as it is")
-    model, problem, windows, baseline = case_problem(fit_key, model, say=say)
-    chosen = problem.chosen
+    taken = _take_case(fit_key, model, say=say)
+    model, windows, chosen = taken.model, taken.windows, taken.chosen
     say(f"{int(chosen.sum())} windows choose, {int((~chosen).sum())} judge")
-    plain, none = detect(key, problem, baseline)
+    plain, none = detect(key, taken.whole, taken.baseline)
     say(f"no mismatch has p = {none.misfit.p_value:.3f}")
-    flexible, bench_flexible, places, shares, forces = None, None, [], np.zeros(0), {}
+    residual = None
     if none.misfit.p_value >= FALSE_ALARMS:
         result = Diagnosis("no_mismatch", plain, none, [])
     else:
-        with ThreadPoolExecutor(1) as pool:  # the residual force without a name is compiled and fitted beside
-            scalar = any(kind in (2, 3) for _, kind, _, _ in model.case.layout.joints)
-            beside = pool.submit(_flexible, key, model, problem, windows, none) if scalar else None
-            result = name_effects(key, problem, none, thresholds=thresholds, say=say)
+        result = name_effects(key, taken.problem, none, thresholds=thresholds, say=say)
+        if result.verdict != "no_mismatch":
             say("fitting a residual force without a name")
-            found = beside.result() if beside else None
-        if found and result.verdict != "no_mismatch":
-            flexible, bench_flexible, places, shares, forces = found
-    bench = result.bench
-    scale = channel_scale(bench.shots)
+            residual = _fit_residual_force(key, taken, none)
+    bench, shots = result.bench, model.shots(windows)
+    scale = channel_scale(shots)
     entries = {"baseline": result.baseline, "augmented": result.best}
-    predictions = {which: _restarted(bench, entry) for which, entry in entries.items()}
-    if flexible is not None and bench_flexible is not None:
-        predictions["flexible"] = _restarted(bench_flexible, flexible)
+    predictions = {which: bench.replay(entry.candidate, entry.fit.z, shots) for which, entry in entries.items()}
+    if residual is not None:
+        predictions["flexible"] = residual.bench.replay(residual.found.candidate, residual.found.p, shots)
     scores, spreads = {}, {}
-    y, measured = np.asarray(bench.shots.y), np.asarray(bench.shots.measured)
+    y, measured = np.asarray(shots.y), np.asarray(shots.measured)
     for which, predicted in predictions.items():
-        reference = compare(predicted[chosen], y[chosen], measured[chosen])
-        spreads[which] = error_spread(reference, scale)
-        scores[which] = score(
-            compare(predicted[~chosen], y[~chosen], measured[~chosen]), spreads[which], scale, bench.channels
-        )
-    locations = _locations(model, windows, chosen, result, places, shares, forces)
+        spreads[which] = error_spread(compare(predicted[chosen], y[chosen], measured[chosen]), scale)
+        judged = compare(predicted[~chosen], y[~chosen], measured[~chosen])
+        scores[which] = score(judged, spreads[which], scale, bench.channels)
+    named = result.verdict != "no_mismatch"
     return CaseDiagnosis(
         model=model,
         bench=bench,
         windows=windows,
         chosen=chosen,
+        shots=shots,
+        pieces=taken.pieces if named else take(windows, chosen),
         result=result,
-        flexible=flexible,
-        flexible_bench=bench_flexible,
-        locations=locations,
+        flexible=residual.found if residual else None,
+        flexible_bench=residual.bench if residual else None,
+        locations=_locations(taken, result, residual) if named else [],
         scores=scores,
         spreads=spreads,
         predictions=predictions,
         scale=scale,
-        noise_floor=_floor(bench, result.best, scale, model, chosen),
+        noise_floor=_floor(bench, result.best, scale, model, shots),
         theta={which: _theta(bench, entry) for which, entry in entries.items()},
         probabilities=_probabilities(result),
         next_experiment=_advice(result),
     )
 
 
-def _restarted(bench: Bench, entry: Entry) -> Float[np.ndarray, "windows rows obs"]:
-    """Predictions of every window from its recorded initial state."""
-    still = dataclasses.replace(entry.fit, delta=jnp.zeros_like(entry.fit.delta))
-    r = np.asarray(bench.look(entry.candidate, still, jnp.ones_like(bench.shots.measured))[0])
-    return np.asarray(bench.shots.y) - r
-
-
-def _floor(bench: Bench, entry: Entry, scale: np.ndarray, model: CaseModel, chosen: np.ndarray) -> float:
+def _floor(bench: Bench, entry: Entry, scale: np.ndarray, model: CaseModel, shots: Shots) -> float:
     """The nrmse that noise leaves to the best model: of the sensors, and of the recorded initial states, propagated."""
     noise = entry.misfit.noise
-    mask = np.asarray(bench.shots.measured) & chosen[:, None, None]
-    slopes = np.asarray(bench.look(entry.candidate, entry.fit, jnp.asarray(mask))[1])
-
-    kept = dataclasses.replace(entry.fit, delta=entry.fit.delta[chosen], sigma=jnp.asarray(noise))
-    start = start_spread(model, kept) / np.asarray(bench.shots.spread)
-    grown = slopes.reshape(*slopes.shape[:2], *mask.shape[1:]) * start[:, None, None]
-    variance = noise**2 + (grown**2).sum(1)
+    start = start_spread(model, dataclasses.replace(entry.fit, sigma=jnp.asarray(noise)))
+    here, variance = bench.replay(entry.candidate, entry.fit.z, shots), noise**2
+    for move in np.diag(start):
+        variance = variance + (bench.replay(entry.candidate, entry.fit.z, shots, jnp.asarray(move)) - here) ** 2
+    mask = np.asarray(shots.measured) & np.isfinite(variance)
     mask[:, 0] = False
     counts = mask.sum((0, 1))
     mean = np.where(mask, variance, 0.0).sum((0, 1)) / np.maximum(counts, 1)
     return float((np.sqrt(mean) / scale)[counts > 0].mean())
 
 
-def _flexible(
-    key: Array, model: CaseModel, problem: Problem, windows: Windows, none: Entry
-) -> tuple[Entry, Bench, list[str], np.ndarray, dict[str, tuple[np.ndarray, ...]]]:
+@dataclass(frozen=True)
+class _Residual:
+    """A force without a name at every joint."""
+
+    found: Screened
+    bench: Bench
+    places: list[str]
+    shares: Float[np.ndarray, " places"]
+    forces: dict[str, tuple[np.ndarray, ...]]
+    """Force, position, velocity, drive and time along the motion."""
+
+
+def _fit_residual_force(key: Array, taken: _Taken, none: Entry) -> _Residual | None:
     """A flexible force at all joints, what each joint alone explains, and the forces along the recordings."""
+    model, problem = taken.model, taken.problem
     joints = [(name, q, v) for name, kind, q, v in model.case.layout.joints if kind in (2, 3)]
+    if not joints:
+        return None
     places = [f"joint/{name}" for name, _, _ in joints]
-    scales, chosen = {p: problem.scales[p] for p in places}, problem.chosen
+    scales = {p: problem.scales[p] for p in places}
     pairs = [(FlexibleForce(p, scales[p]), p) for p in places]
-    bench = problem.bench(pairs, slots=FEATURES * len(places))
-    start = none.fit
-    entry = enter(key, problem, bench, Candidate(tuple(range(len(pairs)))), start)
-    left = [share_left(entry, none)]
-    if len(places) > 1:
-        alone = [enter(key, problem, bench, Candidate((k,)), start, 1) for k in range(len(places))]
-        left = [share_left(e, none) for e in alone]
-    weights = np.asarray(jnp.stack([bench.each[0].value(z) for z in entry.fit.z[bench.d :]]))
-    forces = {}
-    gears = _gears(model)
-    rows = np.concatenate([np.zeros((len(windows), 0), bool), windows.valid], axis=1) & chosen[:, None]
+    slots = FEATURES * len(places)
+    screen = problem.screen(pairs, slots)
+    nothing = screen.begin(none.fit.z[: screen.d], none.fit.sigma)
+    found = screen.settle(Candidate(tuple(range(len(pairs)))), nothing.p, nothing.delta, nothing.sigma)
+    if found is None:
+        return None
+    before, left = screen.misfit(key, nothing), []
+    for k in range(len(places)):
+        alone = screen.settle(Candidate((k,)), nothing.p, nothing.delta, nothing.sigma)
+        left.append(1.0 if alone is None else share_left(screen.misfit(key, alone), before))
+    bench = problem.bench(pairs, slots)
+    weights = np.asarray(jnp.stack([bench.each[0].value(z) for z in found.p[bench.d :]]))
+    motion, gears, forces = problem.motion, _gears(model), {}
+    rows = taken.pieces.valid
+    time = (taken.pieces.start[:, None] + taken.pieces.time[:, :-1])[rows]
     for k, (place, (_, q, v)) in enumerate(zip(places, joints, strict=True)):
-        position, velocity = windows.qpos[:, :-1, q][rows], windows.qvel[:, :-1, v][rows]
-        drive = (windows.ctrl @ gears[:, v])[rows] if windows.ctrl.shape[-1] else np.zeros(rows.sum())
+        position, velocity = (np.asarray(x)[rows] for x in (motion.qpos[:, :-1, q], motion.qvel[:, :-1, v]))
+        drive = (np.asarray(motion.ctrl) @ gears[:, v])[rows] if motion.ctrl.shape[-1] else np.zeros(rows.sum())
         state = (jnp.asarray(position), jnp.asarray(velocity), jnp.asarray(drive))
         phi = np.stack([np.asarray(f) for f in features(*state, scales[place])])
         own = weights[k * FEATURES : (k + 1) * FEATURES]
-        time = (windows.start[:, None] + windows.time[:, :-1])[rows]
         forces[place] = (scales[place].force * (own @ phi), position, velocity, drive, time)
-    return entry, bench, places, shares_from_left(left), forces
+    return _Residual(found, bench, places, shares_from_left(left), forces)
 
 
 def _gears(model: CaseModel) -> Float[np.ndarray, "nu nv"]:
@@ -345,34 +379,26 @@ def _gears(model: CaseModel) -> Float[np.ndarray, "nu nv"]:
     return gears
 
 
-def _locations(
-    model: CaseModel,
-    windows: Windows,
-    chosen: np.ndarray,
-    result: Diagnosis,
-    places: Sequence[str],
-    shares: np.ndarray,
-    forces: dict[str, tuple[np.ndarray, ...]],
-) -> list[Location]:
+def _locations(taken: _Taken, result: Diagnosis, residual: _Residual | None) -> list[Location]:
     """Joints by their share; what a verdict names stands under its own name."""
-    if result.verdict == "no_mismatch":
-        return []
-    every = np.maximum(result.baseline.misfit.excess[chosen], 0.0)
-    names = [model.recordings[i].name for i in windows.recording[chosen]]
-    when = find_windows_of(every.sum(1), names, windows.start[chosen], model.case.case.horizon)
-    if not places:
+    model, pieces = taken.model, taken.pieces
+    every = np.maximum(result.baseline.misfit.excess, 0.0)
+    names = [model.recordings[i].name for i in pieces.recording]
+    length = float(pieces.time.max())
+    when = find_windows_of(every.sum(1), names, pieces.start, length)
+    if residual is None:
         return _by_channel(model, every.sum(0), when)
     named = {}
     if result.verdict == "explained":
         own = [name.partition("@")[2] for name in result.best.names]
         named = {_joint_of(model, place): place for place in own}
     found = []
-    for k in np.argsort(-shares).tolist():
-        place = str(places[k])
-        force, position, velocity, drive, time = forces[place]
+    for k in np.argsort(-residual.shares).tolist():
+        place = str(residual.places[k])
+        force, position, velocity, drive, time = residual.forces[place]
         regime = find_regime(force, position, velocity, drive, time, result.bench.scales[place])
-        if shares[k] >= 0.02 or not found:
-            found.append(Location(named.get(place, place), float(shares[k]), regime, when))
+        if residual.shares[k] >= 0.02 or not found:
+            found.append(Location(named.get(place, place), float(residual.shares[k]), regime, when))
     total = sum(location.share for location in found)
     for location in found:
         location.share = round(location.share / total, 4)

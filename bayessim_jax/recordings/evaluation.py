@@ -38,13 +38,14 @@ def write_state(folder: RunFolder, diagnosis: CaseDiagnosis) -> None:
     for name in diagnosis.scores:
         if name == "flexible":
             assert diagnosis.flexible is not None and diagnosis.flexible_bench is not None
-            own, entry = diagnosis.flexible_bench, diagnosis.flexible
+            own, candidate, x = diagnosis.flexible_bench, diagnosis.flexible.candidate, diagnosis.flexible.p
         else:
-            own, entry = bench, diagnosis.result.baseline if name == "baseline" else diagnosis.result.best
+            entry = diagnosis.result.baseline if name == "baseline" else diagnosis.result.best
+            own, candidate, x = bench, entry.candidate, entry.fit.z
         entries[name] = {
-            "effects": [[own.pairs[k][0].name, own.pairs[k][1]] for k in entry.candidate.effects],
-            "theta": np.asarray(own.margins.theta(entry.fit.z[: own.d])).tolist(),
-            "values": list(own.values(entry.candidate, entry.fit.z).values()),
+            "effects": [[own.pairs[k][0].name, own.pairs[k][1]] for k in candidate.effects],
+            "theta": np.asarray(own.margins.theta(x[: own.d])).tolist(),
+            "values": list(own.values(candidate, x).values()),
             "spread": diagnosis.spreads[name].tolist(),
         }
     state = {

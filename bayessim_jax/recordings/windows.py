@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
 
     from bayessim_jax.recordings.recording import CaseRecording, Span
 
-__all__ = ["Windows", "find_windows", "stack_windows"]
+__all__ = ["Windows", "cut_windows", "find_windows", "stack_windows"]
 
 
 @dataclass(frozen=True)
@@ -98,3 +99,26 @@ def stack_windows(recordings: Sequence[CaseRecording], horizon: float, stride: f
         valid=stacked("valid", rows - 1),
         **{name: stacked(name, rows) for name in names},
     )
+
+
+def cut_windows(windows: Windows, rows: int) -> Windows:
+    """Windows in equal pieces of about so many rows each; what is left over at the end of a window is dropped."""
+    steps = windows.valid.shape[1]
+    length = steps // max(round(steps / rows), 1)
+    parts = []
+    for first in range(0, steps - length + 1, length):
+        each = {}
+        for f in dataclasses.fields(windows):
+            values = getattr(windows, f.name)
+            if values.ndim > 1:
+                more = length if f.name in ("ctrl", "valid") else length + 1
+                values = values[:, first : first + more]
+            each[f.name] = values
+        time = each["time"]
+        each["start"] = each["start"] + time[:, 0]
+        each["time"] = np.where(time >= time[:, :1], time - time[:, :1], 0.0)
+        parts.append(each)
+    joined = {name: np.stack([part[name] for part in parts], 1) for name in parts[0]}
+    flat = {name: values.reshape(len(windows) * len(parts), *values.shape[2:]) for name, values in joined.items()}
+    held = flat["valid"].any(axis=1)
+    return Windows(**{name: values[held] for name, values in flat.items()})

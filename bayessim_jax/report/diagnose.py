@@ -37,7 +37,7 @@ def headline(diagnosis: CaseDiagnosis) -> str:
         sentence = f"Something is missing at {where or 'no single joint'}, and none of the candidates explains it."
         if result.entries:
             best = result.entries[0]
-            left = number(100 * share_left(best, result.baseline))
+            left = number(100 * share_left(best.misfit, result.baseline.misfit))
             sentence += f" The closest, {' + '.join(best.names)}, leaves {left} % of the misfit."
         return sentence
     change = f"{held} miss by {number(100 * after)} % of a channel's spread instead of {number(100 * before)} %"
@@ -105,7 +105,7 @@ def _series(diagnosis: CaseDiagnosis) -> list[dict[str, Any]]:
 
 
 def _traces(diagnosis: CaseDiagnosis) -> str:
-    shots = diagnosis.bench.shots
+    shots = diagnosis.shots
     values = {**diagnosis.predictions, "measured": np.where(np.asarray(shots.measured), np.asarray(shots.y), np.nan)}
     caption = (
         f"Held-out recordings; predictions restart from them every {diagnosis.model.case.case.horizon:g} s. The wheel "
@@ -138,12 +138,9 @@ def _places(diagnosis: CaseDiagnosis) -> str:
 
 
 def _map(diagnosis: CaseDiagnosis) -> tuple[str, str, str]:
-    chosen, windows = diagnosis.chosen, diagnosis.windows
-    names = [diagnosis.model.recordings[i].name for i in windows.recording[chosen]]
-    after = diagnosis.result.best.misfit.excess[chosen]
-    svg = misfit_map(
-        diagnosis.result.baseline.misfit.excess[chosen], after, names, windows.start[chosen], diagnosis.model.channels
-    )
+    names = [diagnosis.model.recordings[i].name for i in diagnosis.pieces.recording]
+    before, after = (entry.misfit.excess for entry in (diagnosis.result.baseline, diagnosis.result.best))
+    svg = misfit_map(before, after, names, diagnosis.model.channels)
     caption = (
         "Slow power in the residuals of every window above what noise leaves, a row for each channel: of the simulator "
         "as it is (above), and with the best candidate (below)."
@@ -161,14 +158,14 @@ def _entries(diagnosis: CaseDiagnosis) -> str:
     base = diagnosis.result.baseline
     for entry in diagnosis.result.entries:
         named = "yes" if entry in diagnosis.result.confusion else ""
-        left = share_left(entry, base)
+        left = share_left(entry.misfit, base.misfit)
         rows.append([" + ".join(entry.names), number(entry.score - base.score, 4), f"{100 * left:.2g} %", named])
     return html.table(["finalist", "gain on recordings left out", "misfit left", "named"], rows)
 
 
 def _residuals(diagnosis: CaseDiagnosis) -> tuple[str, str, str]:
     held = ~diagnosis.chosen
-    y, measured = np.asarray(diagnosis.bench.shots.y)[held], np.asarray(diagnosis.bench.shots.measured)[held]
+    y, measured = np.asarray(diagnosis.shots.y)[held], np.asarray(diagnosis.shots.measured)[held]
     shown = ["baseline", *(["augmented"] if diagnosis.result.verdict in ("explained", "ambiguous") else [])]
     errors = {name: np.where(measured, y - diagnosis.predictions[name][held], np.nan) for name in shown}
     noise = diagnosis.result.best.misfit.noise

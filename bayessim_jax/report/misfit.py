@@ -23,7 +23,6 @@ def misfit_map(
     before: Float[np.ndarray, "windows obs"],
     after: Float[np.ndarray, "windows obs"],
     recording: Sequence[str],
-    start: Float[np.ndarray, " windows"],
     channels: Sequence[str],
 ) -> str:
     """Excess power of every window and channel on a logarithmic scale, with recordings apart."""

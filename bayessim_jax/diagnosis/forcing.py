@@ -1,0 +1,165 @@
+"""What an effect does along a recorded motion: the force it exerts, and how that changes with its parameters.
+
+The effects' own equations are evaluated on the smoothed motion, remembering what they remember. Nothing is simulated,
+and the programs know no model: another machine finds them in the compilation cache.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from bayessim_jax.beliefs.margins import Margin
+from bayessim_jax.effects import Moment
+
+__all__ = ["Joint", "Kinds", "force_of", "restore_readings", "commands_of"]
+
+Kinds = tuple[tuple[str, str], ...]
+"""Name and kind of margin of every parameter of an effect."""
+
+
+@struct.dataclass
+class Joint:
+    """A joint's motion at the beginning of every time step, `windows steps`."""
+
+    position: Float[Array, "windows steps"]
+    velocity: Float[Array, "windows steps"]
+    acceleration: Float[Array, "windows steps"]
+    """Of the simulator without the effect."""
+    inertia: Float[Array, "windows steps"]
+    drive: Float[Array, "windows steps"]
+
+    def moment(self, time: Array, h: float) -> Moment:
+        """As effects see it."""
+        return Moment(time, h, self.position, self.velocity, self.acceleration, self.inertia, self.drive)
+
+
+def _values(kinds: Kinds, x: Array, low: Array, high: Array) -> dict[str, Array]:
+    margins = [Margin(kind, 0.0, 1.0) for _, kind in kinds]
+    return {
+        name: dataclasses.replace(m, a=low[k], b=high[k]).value(x[k])
+        for k, (m, (name, _)) in enumerate(zip(margins, kinds, strict=True))
+    }
+
+
+@partial(jax.jit, static_argnames=("effect", "kinds", "detail", "h", "steps"))
+def force_of(
+    effect: Any,
+    kinds: Kinds,
+    detail: str,
+    h: float,
+    steps: int,
+    x: Float[Array, " k"],
+    low: Float[Array, " k"],
+    high: Float[Array, " k"],
+    time: Float[Array, "windows steps"],
+    joint: Joint,
+    other: Joint | None,
+) -> tuple[Float[Array, "windows rows"], Float[Array, "windows rows k"]]:
+    """Mean force of a `ForceEffect` in every row of so many time steps, and its derivatives along x."""
+
+    def force(x: Array) -> Array:
+        values = _values(kinds, x, low, high)
+
+        def window(time: Array, joint: Joint, other: Joint | None) -> Array:
+            def moment(time: Array, joint: Joint, other: Joint | None) -> Moment:
+                beside = None if other is None else other.moment(time, h)
+                return joint.moment(time, h)._replace(detail=detail, other=beside)
+
+            def once(memory: Any, now: Any) -> tuple[Any, Array]:
+                f, memory = effect.force(values, memory, moment(*now))
+                return memory, f * jnp.ones(())
+
+            rows = (time, joint, other)
+            first = jax.tree.map(lambda a: a[0], rows)
+            begun = jax.tree.map(lambda m: jnp.asarray(m, time.dtype), effect.begin(values, moment(*first)))
+            return jax.lax.scan(once, begun, rows)[1].reshape(-1, steps).mean(-1)
+
+        return jax.vmap(window)(time, joint, other)
+
+    return _with_slopes(force, x)
+
+
+@partial(jax.jit, static_argnames=("effect", "kinds", "h", "steps", "before"))
+def commands_of(
+    effect: Any,
+    kinds: Kinds,
+    h: float,
+    steps: int,
+    before: int,
+    x: Float[Array, " k"],
+    low: Float[Array, " k"],
+    high: Float[Array, " k"],
+    time: Float[Array, "windows steps"],
+    joint: Joint,
+    commands: Float[Array, "windows steps act"],
+    gain: Float[Array, ""],
+) -> tuple[Float[Array, "windows rows act"], Float[Array, "windows rows act k"]]:
+    """What an `ActEffect` changes in commands, on average over every row, and its derivatives along x.
+
+    The first `before` time steps come before the window and only fill what the effect remembers.
+    """
+    single = commands.shape[-1] == 1
+
+    def change(x: Array) -> Array:
+        values = _values(kinds, x, low, high)
+
+        def window(time: Array, joint: Joint, commands: Array) -> Array:
+            def moment(time: Array, joint: Joint) -> Moment:
+                return joint.moment(time, h)._replace(gain=gain)
+
+            def pick(row: Array) -> Any:
+                return row[0] if single else tuple(row)
+
+            def once(memory: Any, now: tuple[Array, Joint, Array]) -> tuple[Any, Array]:
+                time, joint, row = now
+                new, memory = effect.command(values, memory, pick(row), moment(time, joint))
+                return memory, jnp.stack(new if isinstance(new, tuple) else (new,)) - row
+
+            rows = (time, joint, commands)
+            first = jax.tree.map(lambda a: a[0], rows)
+            begun = effect.begin(values, pick(first[2]), moment(*first[:2]))
+            begun = jax.tree.map(lambda m: jnp.asarray(m, time.dtype), begun)
+            changes = jax.lax.scan(once, begun, rows)[1][before:]
+            return changes.reshape(-1, steps, changes.shape[-1]).mean(1)
+
+        return jax.vmap(window)(time, joint, commands)
+
+    return _with_slopes(change, x)
+
+
+@partial(jax.jit, static_argnames=("effect", "kinds", "period"))
+def restore_readings(
+    effect: Any,
+    kinds: Kinds,
+    period: float,
+    x: Float[Array, " k"],
+    low: Float[Array, " k"],
+    high: Float[Array, " k"],
+    time: Float[Array, "windows rows"],
+    position: Float[Array, "windows rows"],
+    velocity: Float[Array, "windows rows"],
+    acceleration: Float[Array, "windows rows"],
+    jerk: Float[Array, "windows rows"],
+) -> tuple[Array, Array, Array, Array]:
+    """True positions and velocities behind readings of a `SenseEffect`, ∂q/∂x, and ∂q/∂reading."""
+
+    def restore(x: Array, position: Array) -> tuple[Array, Array]:
+        moment = Moment(time, period, position, velocity, acceleration, jerk=jerk)
+        q, v = effect.restore(_values(kinds, x, low, high), moment)
+        return q * jnp.ones_like(time), v * jnp.ones_like(time)
+
+    (q, v), slope = jax.jvp(lambda position: restore(x, position), (position,), (jnp.ones_like(position),))
+    along = jax.vmap(lambda d: jax.jvp(lambda x: restore(x, position)[0], (x,), (d,))[1])(jnp.eye(x.size))
+    return q, v, jnp.moveaxis(along, 0, -1), slope[0]
+
+
+def _with_slopes(f: Any, x: Array) -> tuple[Array, Array]:
+    along = jax.vmap(lambda d: jax.jvp(f, (x,), (d,))[1])(jnp.eye(x.size))
+    return f(x), jnp.moveaxis(along, 0, -1)

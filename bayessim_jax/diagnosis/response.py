@@ -1,0 +1,279 @@
+"""A simulator's linear response around recorded motion: what any force would have changed in what was measured.
+
+Let x̄ be the smoothed motion. The deviation e = x − x̄ of a simulation with further forces f obeys
+
+    e_{t+1} = A_t e_t + (F(x̄_t, u_t; θ) − x̄_{t+1}) + B_t f_t + O(e²)
+
+with F one row's step of the simulator and A, B its derivatives at x̄. It is expanded around the motion itself and not
+around a prediction: for the right forces e is no larger than the error of the smoothing, however strong they are, so
+that candidates are compared without simulating any of them, and without compiling one either. What is fitted is what
+`inference.shooting` fits: θ, the candidate's parameters and every window's initial state, to what was measured.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+from bayessim_jax.contracts import Scalar
+from bayessim_jax.inference.shooting import Curvature, eliminate
+from bayessim_jax.systems.mjcf import displace
+
+__all__ = [
+    "Forcing",
+    "Linearized",
+    "Motion",
+    "Windowed",
+    "assess",
+    "cross_validate",
+    "linearize_steps",
+    "propose",
+]
+
+
+@struct.dataclass
+class Motion:
+    """Smoothed motion in windows, and the commands."""
+
+    qpos: Float[Array, "windows rows nq"]
+    qvel: Float[Array, "windows rows nv"]
+    ctrl: Float[Array, "windows steps nu"]
+    past: Float[Array, "windows before nu"]
+    start: Float[Array, " windows"]
+    """s in its recording."""
+
+
+@struct.dataclass
+class Linearized:
+    """One row's step around the motion, for every row; n = 2 nv is (move along every degree of freedom, velocity)."""
+
+    a: Float[Array, "windows steps n n"]
+    b: Float[Array, "windows steps n nv"]
+    """Per generalized force held for the row."""
+    along: Float[Array, "windows steps n k"]
+    """Along θ's z and the model's own parameters of a candidate."""
+    gap: Float[Array, "windows steps n"]
+    """F(x̄_t, u_t; θ) − x̄_{t+1}."""
+
+
+@struct.dataclass
+class Windowed:
+    """What was measured, and how it is seen of a deviation."""
+
+    y: Float[Array, "windows rows obs"]
+    measured: Bool[Array, "windows rows obs"]
+    seen: Float[Array, "windows rows obs"]
+    """Of the motion itself."""
+    c: Float[Array, "windows rows obs n"]
+    spread: Float[Array, " n"]
+    """Standard deviation of an initial state."""
+
+
+@struct.dataclass
+class Forcing:
+    """What a candidate adds to every row's step, and to readings, at one point of its parameters."""
+
+    force: Float[Array, "windows steps nv"]
+    force_along: Float[Array, "windows steps nv k"]
+    scale: Float[Array, "windows rows obs"]
+    """Readings are `scale · reading + shift`: 1 where no sensor is concerned."""
+    shift: Float[Array, "windows rows obs"]
+    reading_along: Float[Array, "windows rows obs k"]
+
+
+def separate(model: mujoco.MjModel, origin: Float[Array, " nq"], to: Float[Array, " nq"]) -> Float[Array, " nv"]:
+    """The move along every degree of freedom that leads from one pose to another: the inverse of `displace`."""
+    pieces, free, ball = [], mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
+    for joint in range(model.njnt):
+        q, kind = int(model.jnt_qposadr[joint]), model.jnt_type[joint]
+        if kind == free:
+            pieces += [to[q : q + 3] - origin[q : q + 3], _rotation(origin[q + 3 : q + 7], to[q + 3 : q + 7])]
+        elif kind == ball:
+            pieces.append(_rotation(origin[q : q + 4], to[q : q + 4]))
+        else:
+            pieces.append(to[q : q + 1] - origin[q : q + 1])
+    return jnp.concatenate(pieces)
+
+
+def _rotation(origin: Float[Array, "4"], to: Float[Array, "4"]) -> Float[Array, "3"]:
+    """Rotation vector of a small turn: 2 vec(origin⁻¹ to)."""
+    w, v, ow, ov = to[0], to[1:], origin[0], origin[1:]
+    turn = ow * v - w * ov - jnp.cross(ov, v)
+    return 2.0 * jnp.sign(ow * w + ov @ v) * turn
+
+
+@partial(jax.jit, static_argnames=("engine", "numbers", "substeps", "step"))
+def linearize_steps(
+    engine: Any,
+    numbers: Any,
+    motion: Motion,
+    x: Float[Array, " m"],
+    along: Float[Array, "k m"],
+    substeps: int,
+    step: float,
+) -> Linearized:
+    """Every row's step around the motion at a point x, with derivatives along some directions of it.
+
+    `numbers(x)` is the engine's θ. Forward-mode derivatives, or central differences of length `step`.
+    """
+    model = engine.model
+    nv = model.nv
+    inner, inner_along = numbers(x), jax.vmap(lambda v: jax.jvp(numbers, (x,), (v,))[1])(along)
+
+    def one(q: Array, v: Array, q_next: Array, v_next: Array, u: Array) -> tuple[Array, ...]:
+        def advance(move: Array, force: Array, inner: Array) -> Array:
+            state = engine.init(inner, displace(model, q, move[:nv]), v + move[nv:])
+            after = engine.step(inner, state, u, force, substeps)
+            return jnp.concatenate([separate(model, q_next, engine.qpos(after)), engine.qvel(after) - v_next])
+
+        point = (jnp.zeros(2 * nv, v.dtype), jnp.zeros(nv, v.dtype), inner)
+        size = 3 * nv + len(along)
+        directions = (
+            jnp.zeros((size, 2 * nv)).at[: 2 * nv].set(jnp.eye(2 * nv)),
+            jnp.zeros((size, nv)).at[2 * nv : 3 * nv].set(jnp.eye(nv)),
+            jnp.zeros((size, inner.size)).at[3 * nv :].set(inner_along),
+        )
+        if step:
+            moved = lambda d, s: advance(*jax.tree.map(lambda p, m: p + s * step * m, point, d))  # noqa: E731
+            slopes = jax.vmap(lambda d: (moved(d, 1.0) - moved(d, -1.0)) / (2 * step))(directions)
+            gap = advance(*point)
+        else:
+            gap = advance(*point)
+            slopes = jax.vmap(lambda d: jax.jvp(advance, point, d)[1])(directions)
+        slopes = slopes.T
+        return slopes[:, : 2 * nv], slopes[:, 2 * nv : 3 * nv], slopes[:, 3 * nv :], gap
+
+    rows = (motion.qpos[:, :-1], motion.qvel[:, :-1], motion.qpos[:, 1:], motion.qvel[:, 1:], motion.ctrl)
+    return Linearized(*jax.vmap(jax.vmap(one))(*rows))
+
+
+def _propagate(a: Array, first: Float[Array, "n k"], added: Float[Array, "steps n k"]) -> Float[Array, "rows n k"]:
+    """e_{t+1} = A_t e_t + g_t, for several columns at once."""
+
+    def once(e: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
+        after = now[0] @ e + now[1]
+        return after, after
+
+    return jnp.concatenate([first[None], jax.lax.scan(once, first, (a, added))[1]])
+
+
+@jax.jit
+def assess(
+    lin: Linearized,
+    windowed: Windowed,
+    forcing: Forcing,
+    moved: Float[Array, " k"],
+    p: Float[Array, " k"],
+    delta: Float[Array, "windows n"],
+    sigma: Float[Array, " obs"],
+) -> tuple[Curvature, Float[Array, "windows rows obs"], Float[Array, "windows kn rowsobs"]]:
+    """Normal equations, residuals over σ and derivatives of what is predicted over σ.
+
+    p is [θ's z, the candidate's x], each with a standard normal prior, and `moved` how far it is from where the steps
+    were linearized.
+    """
+    n, k = delta.shape[-1], p.size
+
+    def one(a: Array, b: Array, along: Array, gap: Array, w: Windowed, f: Forcing, d: Array) -> tuple[Array, Array]:
+        forced = gap + jnp.einsum("tnv,tv->tn", b, f.force) + along @ moved
+        columns = along + jnp.einsum("tnv,tvk->tnk", b, f.force_along)
+        first = jnp.concatenate([d[:, None], jnp.zeros((n, k)), jnp.eye(n)], 1)
+        added = jnp.concatenate([forced[..., None], columns, jnp.zeros((len(gap), n, n))], -1)
+        seen = jnp.einsum("ton,tnk->tok", w.c, _propagate(a, first, added))
+        value = f.scale * (w.seen + seen[..., 0]) + f.shift
+        slopes = f.scale[..., None] * seen[..., 1:]
+        slopes = slopes.at[..., :k].add(f.reading_along)
+        r = jnp.where(w.measured, (w.y - value) / sigma, 0.0)
+        slopes = jnp.where(w.measured[..., None], slopes / sigma[:, None], 0.0)
+        return r, slopes.reshape(-1, k + n).T
+
+    spread = jnp.broadcast_to(windowed.spread, (len(delta), n))
+    each = replace(windowed, spread=spread)
+    r, slopes = jax.vmap(one)(lin.a, lin.b, lin.along, lin.gap, each, forcing, delta)
+    slopes = slopes.at[:, k:].multiply(windowed.spread[:, None])
+    return _normal(r.reshape(len(delta), -1), slopes, p, delta / windowed.spread), r, slopes
+
+
+def _normal(r: Array, slopes: Array, p: Array, scaled: Array) -> Curvature:
+    k, n = p.size, scaled.shape[-1]
+    products = jnp.einsum("wik,wjk->wij", slopes, slopes)
+    pulls = jnp.einsum("wik,wk->wi", slopes, r)
+    return Curvature(
+        cost=0.5 * ((r**2).sum() + p @ p + (scaled**2).sum()),
+        hessian=products[:, :k, :k].sum(0) + jnp.eye(k),
+        gradient=pulls[:, :k].sum(0) - p,
+        own=products[:, k:, k:] + jnp.eye(n),
+        cross=products[:, k:, :k],
+        own_gradient=pulls[:, k:] - scaled,
+    )
+
+
+@jax.jit
+def propose(
+    curvature: Curvature, damping: Scalar, free: Bool[Array, " k"], spread: Float[Array, " n"]
+) -> tuple[Float[Array, " k"], Float[Array, "windows n"]]:
+    """A Levenberg-Marquardt step of (p, initial states)."""
+    precision, gradient, toward, shift = eliminate(curvature, damping)
+    held = jnp.outer(free, free)
+    precision = jnp.where(held, precision, jnp.eye(len(free))) + damping * jnp.diag(jnp.diagonal(curvature.hessian))
+    move = jnp.linalg.solve(precision, jnp.where(free, gradient, 0.0))
+    move = move * jnp.minimum(1.0, 1.0 / jnp.maximum(jnp.abs(move).max(initial=0.0), 1e-12))
+    return move, (shift - toward @ move) * spread
+
+
+@jax.jit
+def cross_validate(
+    r: Float[Array, "windows rows obs"],
+    slopes: Float[Array, "windows kn rowsobs"],
+    measured: Bool[Array, "windows rows obs"],
+    p: Float[Array, " k"],
+    free: Bool[Array, " k"],
+    sigma: Float[Array, " obs"],
+    floor: Float[Array, " obs"],
+    folds: Bool[Array, "folds windows"],
+) -> Float[Array, " windows"]:
+    """Log predictive density of every window by fits without the windows of its fold, linear around one fit to all.
+
+    Noise is that of the training windows; a window's own initial state is profiled out.
+    """
+    k = p.size
+    n = slopes.shape[1] - k
+    flat = r.reshape(len(r), -1)
+    free_all = jnp.concatenate([free, jnp.ones(n, bool)])
+    slopes = jnp.where(free_all[:, None], slopes, 0.0)
+
+    def fit(weight: Array) -> tuple[Array, Array]:
+        """The move of p by windows of some weight, and what is then left of every window with its own best state."""
+        own = jnp.einsum("wik,wjk->wij", slopes[:, k:], slopes[:, k:]) + jnp.eye(n)
+        cross = jnp.einsum("wik,wjk->wij", slopes[:, k:], slopes[:, :k])
+        pull = jnp.einsum("wik,wk->wi", slopes, flat)
+        toward = jnp.linalg.solve(own, jnp.concatenate([cross, pull[:, k:, None]], -1))
+        hessian = jnp.einsum("wik,wjk->wij", slopes[:, :k], slopes[:, :k]) - jnp.einsum(
+            "wni,wnj->wij", cross, toward[..., :k]
+        )
+        gradient = pull[:, :k] - jnp.einsum("wni,wn->wi", cross, toward[..., k])
+        total = jnp.einsum("w,wij->ij", weight, hessian) + jnp.eye(k)
+        move = jnp.linalg.solve(total, jnp.einsum("w,wi->i", weight, gradient) - p)
+        move = jnp.where(free, move, 0.0)
+        state = toward[..., k] - toward[..., :k] @ move
+        left = flat - jnp.einsum("wik,i->wk", slopes[:, :k], move) - jnp.einsum("wik,wi->wk", slopes[:, k:], state)
+        return move, left.reshape(r.shape)
+
+    def one(out: Array) -> Array:
+        weight = 1.0 - out.astype(flat.dtype)
+        left = fit(weight)[1]
+        counts = jnp.einsum("w,wro->o", weight, measured.astype(flat.dtype))
+        share = jnp.maximum(1.0 - (k + n * weight.sum()) / jnp.maximum(counts.sum(), 1.0), 0.2)
+        ratio = jnp.sqrt(jnp.einsum("w,wro->o", weight, left**2) / jnp.maximum(counts * share, 1.0))
+        ratio = jnp.maximum(ratio, floor / sigma)
+        logs = jnp.where(measured, -0.5 * (left / ratio) ** 2 - jnp.log(ratio * sigma), 0.0)
+        return jnp.where(out, logs.sum((1, 2)), 0.0)
+
+    return jax.vmap(one)(folds).sum(0)
