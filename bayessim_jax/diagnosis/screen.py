@@ -151,7 +151,8 @@ class Screen:
     ) -> tuple[Any, ...]:
         """Levenberg-Marquardt from a point; returns (p, δ, curvature, residuals, slopes)."""
         free = jnp.arange(self.d + self.slots) < self.d + self.count(candidate)
-        damping, here = 1e-3, None
+        damping = 1e-3
+        here: Any = None
         tried = (p, delta)
         for _ in range(iterations):
             there = self._assess(candidate, *tried, sigma)
@@ -333,8 +334,8 @@ class Screen:
             q, v = int(self.model.jnt_qposadr[joint]), int(self.model.jnt_dofadr[joint])
             channels = [c.name for c in self.system.channels]
             velocity = motion.qvel[..., v]
-            acceleration = jnp.gradient(velocity, self.system.dt, axis=1)
-            jerk = jnp.gradient(acceleration, self.system.dt, axis=1)
+            acceleration = jnp.asarray(jnp.gradient(velocity, self.system.dt, axis=1))
+            jerk = jnp.asarray(jnp.gradient(acceleration, self.system.dt, axis=1))
             low, high = self._range(k)
             new_q, new_v, along, slope = restore_readings(
                 effect,

@@ -39,6 +39,8 @@ __all__ = ["CaseDiagnosis", "diagnose_case"]
 
 MOST_FITTED, MOST_HELD = 44, 20
 """Windows that choose and windows that judge; of longer recordings they are spread evenly."""
+LONG = 15
+"""Steps of the solver for a force with many weights."""
 PIECE, LEAST = 0.16, 16
 """s and rows: naming is done with pieces of windows of about this length. Stick-slip makes longer ones chaotic."""
 
@@ -346,12 +348,13 @@ def _fit_residual_force(key: Array, taken: _Taken, none: Entry) -> _Residual | N
     slots = FEATURES * len(places)
     screen = problem.screen(pairs, slots)
     nothing = screen.begin(none.fit.z[: screen.d], none.fit.sigma)
-    found = screen.settle(Candidate(tuple(range(len(pairs)))), nothing.p, nothing.delta, nothing.sigma)
+    every = Candidate(tuple(range(len(pairs))))
+    found = screen.settle(every, nothing.p, nothing.delta, nothing.sigma, iterations=LONG)
     if found is None:
         return None
     before, left = screen.misfit(key, nothing), []
     for k in range(len(places)):
-        alone = screen.settle(Candidate((k,)), nothing.p, nothing.delta, nothing.sigma)
+        alone = screen.settle(Candidate((k,)), nothing.p, nothing.delta, nothing.sigma, iterations=LONG)
         left.append(1.0 if alone is None else share_left(screen.misfit(key, alone), before))
     bench = problem.bench(pairs, slots)
     weights = np.asarray(jnp.stack([bench.each[0].value(z) for z in found.p[bench.d :]]))
