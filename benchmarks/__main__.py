@@ -9,6 +9,7 @@ from pathlib import Path
 from benchmarks.timing import CLOCKS, choose_clock
 
 _MECHANISMS = ("pendulum", "cart-pole", "double pendulum", "3-joint arm", "6-joint arm")
+_RIGS = ("pendulum", "slide", "double", "cart", "arm3", "arm6")
 
 
 def main() -> None:
@@ -46,8 +47,8 @@ def main() -> None:
     engines.add_argument("--repeats", type=int, default=5)
     engines.add_argument("--mjx", type=int, default=1024, metavar="BATCH", help="batch of MJX; 0 leaves it out")
 
-    concealed = commands.add_parser("concealed", help="diagnoses of made-up machines with an effect concealed in them")
-    concealed.add_argument("--rigs", nargs="+", default=["pendulum", "slide", "swing", "cart", "double"])
+    concealed = commands.add_parser("concealed", help="diagnoses of machines with effects concealed in them")
+    concealed.add_argument("--rigs", nargs="+", default=[*_RIGS], choices=_RIGS)
     concealed.add_argument("--cases", type=int, default=200)
     concealed.add_argument("--seed", type=int, default=1)
     concealed.add_argument("--out", type=Path, help="file of JSON lines to append cases to, and to resume from")

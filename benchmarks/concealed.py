@@ -1,7 +1,8 @@
-"""Diagnoses of made-up machines with an effect concealed in them: how often it is named, refused, or falsely found."""
+"""Diagnoses of machines with effects concealed in them: how often they are named, refused, or falsely found."""
 
 from __future__ import annotations
 
+import functools
 import json
 import tempfile
 import time
@@ -9,70 +10,130 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
+import mujoco
 import numpy as np
 
-from benchmarks.worlds import CONCEALED, RIGS, UNKNOWN, make_case
+from bayessim_jax.concealment import LAWS, UNKNOWN, StrengthError
+from benchmarks.worlds import RIGS, make_case
 
 if TYPE_CHECKING:
     from argparse import Namespace
 
-__all__ = ["diagnose_concealed", "draw_cases", "judge"]
+__all__ = ["GROUPS", "diagnose_concealed", "draw_cases", "judge", "make_drawn", "summarize"]
+
+GROUPS = {"single": 0.37, "weak": 0.1, "pair": 0.1, "unknown": 0.18, "clean": 0.25}
+"""Shares of the cases: one effect, one weak effect, two, one of no library, none."""
+STRENGTHS = {"weak": (0.02, 0.1)}
+"""Log-uniform between these; of all other groups between 0.1 and 0.6."""
+NOISE = (0.3, 1.0, 3.0)
+ATTEMPTS = 5
+
+
+@functools.cache
+def _compiled(rig: str) -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(RIGS[rig].xml)
+
+
+def _fits(effects: list[str], rig: str) -> bool:
+    return all(LAWS[name].places(_compiled(rig)) for name in effects)
 
 
 def draw_cases(rigs: list[str], count: int, seed: int) -> list[dict[str, Any]]:
-    """A stated random set: a fifth clean, a fifth with what no library holds, the rest with an effect of it."""
+    """A stated random set, every effect in it about as often as every other."""
     rng = np.random.default_rng(seed)
+    possible = [name for name in sorted(LAWS) if any(_fits([name], rig) for rig in rigs)]
+    library = [name for name in possible if not name.startswith(UNKNOWN)]
+    others = [name for name in possible if name.startswith(UNKNOWN)]
+    decks: dict[str, list[str]] = {}
+
+    def deal(deck: str, names: list[str]) -> str:
+        if not decks.get(deck):
+            decks[deck] = [str(name) for name in rng.permutation(names)]
+        return decks[deck].pop()
+
+    groups = [group for group, share in GROUPS.items() for _ in range(round(share * count))]
+    groups = [str(g) for g in rng.permutation([*groups, *["single"] * count][:count])]
     cases = []
-    for index in range(count):
-        rig = rigs[int(rng.integers(len(rigs)))]
-        about = RIGS[rig]
-        joints = 2 if rig in ("double", "cart") else 1
-        kind = rng.choice(["clean", "unknown", "known", "known", "known"])
-        effect, place = None, int(rng.integers(joints))
-        if kind != "clean":
-            names = sorted(UNKNOWN if kind == "unknown" else CONCEALED)
-            names = [n for n in names if about.drive or not (CONCEALED | UNKNOWN)[n].motor]
-            effect = str(rng.choice(names))
-            if (CONCEALED | UNKNOWN)[effect].motor:
-                place = int(rng.integers(len(about.drive)))
-        strength = float(np.round(np.exp(rng.uniform(np.log(0.5), np.log(1.5))), 2))
-        velocities = bool(rng.uniform() < 0.75)
+    for index, group in enumerate(groups):
+        effects = [deal(group, others if group == "unknown" else library)] if group != "clean" else []
+        fitting = [rig for rig in rigs if _fits(effects, rig)]
+        rig = str(fitting[int(rng.integers(len(fitting)))])
+        if group == "pair":
+            second = [name for name in library if name != effects[0] and _fits([name], rig)]
+            effects.append(str(rng.choice(second)))
+        low, high = STRENGTHS.get(group, (0.1, 0.6))
         cases.append(
             {
                 "rig": rig,
-                "effect": effect,
-                "place": place,
-                "strength": strength,
-                "seed": seed * 1000 + index,
-                "velocities": velocities,
+                "group": group,
+                "effects": effects,
+                "strength": round(float(np.exp(rng.uniform(np.log(low), np.log(high)))), 3),
+                "noise": float(rng.choice(NOISE)),
+                "velocities": bool(rng.uniform() < 0.7),
+                "quantize": float(rng.choice([2048.0, 8192.0, 32768.0])) if rng.uniform() < 0.15 else None,
+                "jitter": 0.3 if rng.uniform() < 0.15 else 0.0,
+                "seed": seed * 100_000 + index,
             }
         )
     return cases
 
 
-def judge(case: dict[str, Any], table: dict[str, Any], joints: list[str], motors: list[str]) -> str:
-    """What became of a case: `clean`, `false alarm`, `named`, `among`, `missed`, `refused`, `wrong`."""
-    verdict, effect = table["verdict"], case["effect"]
-    if effect is None:
-        return "clean" if verdict == "no_mismatch" else "false alarm"
-    if verdict == "no_mismatch":
-        return "missed"
-    if verdict == "unexplained":
-        return "refused"
-    sets = table["confusion_set"] or [[f"{e['effect']}@{e['at']}" for e in table["effects"]]]
-    if effect in UNKNOWN:
-        return "wrong"
-    place = case["place"]
-    if CONCEALED[effect].motor:
-        at = f"actuator/{motors[place]}"
-    elif effect == "base_tilt":
-        at = "world"
+def make_drawn(folder: Path, case: dict[str, Any]) -> dict[str, Any]:
+    """Write a case that was drawn; returns what is sealed.
+
+    An effect that cannot be as strong as that comes nearly as strong as it can, or elsewhere.
+    """
+    settings = {k: case[k] for k in ("noise", "velocities", "quantize", "jitter")}
+    told: StrengthError | None = None
+    for attempt in range(ATTEMPTS):
+        asked = case["strength"]
+        for _ in range(2):
+            try:
+                seed = case["seed"] + 10_000_000 * attempt
+                return make_case(folder, case["rig"], case["effects"], strength=asked, seed=seed, **settings)
+            except StrengthError as error:
+                told, asked = error, 0.9 * error.most
+                if asked < (0.02 if case["group"] == "weak" else 0.1):
+                    break
+    assert told is not None
+    raise told
+
+
+def _bare(name: str) -> str:
+    """Effect and place without what follows a `#`."""
+    return name.partition("#")[0]
+
+
+def judge(sealed: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
+    """What became of a case.
+
+    `outcome` is `clean` or `false alarm` where nothing is concealed; else `missed` (no mismatch), `refused`
+    (unexplained), `named` (the one answer), `among` (one of at most three answers), `part` (some of a pair and nothing
+    else) or `wrong`. `joint` says whether most of the misfit was located at a joint with an effect, None where that is
+    at none.
+    """
+    truth = {_bare(f"{e['effect']}@{e['at']}") for e in sealed["effects"]}
+    joints = {e["joint"] for e in sealed["effects"]} - {None}
+    at = table["locations"][0]["at"].removesuffix("/qpos").removesuffix("/qvel") if table["locations"] else ""
+    found = table["confusion_set"] or [[f"{e['effect']}@{e['at']}" for e in table["effects"]]]
+    answers = [{_bare(name) for name in answer} for answer in found]
+    verdict = table["verdict"]
+    if not truth:
+        outcome = "clean" if verdict == "no_mismatch" else "false alarm"
+    elif verdict in ("no_mismatch", "unexplained"):
+        outcome = "missed" if verdict == "no_mismatch" else "refused"
+    elif truth in answers and len(answers) <= 3:
+        outcome = "named" if len(answers) == 1 else "among"
     else:
-        at = f"joint/{joints[place]}" + ("/qpos" if effect.startswith("sensor") else "")
-    name = f"{effect}@{at}"
-    if [name] in sets:
-        return "named" if len(sets) == 1 else "among"
-    return "wrong"
+        outcome = "part" if any(answer < truth for answer in answers) else "wrong"
+    return {
+        "outcome": outcome,
+        "single_best": bool(answers[0] == truth) if truth and verdict in ("explained", "ambiguous") else False,
+        "third": any(answer - truth for answer in answers),
+        "joint": at in joints if joints and verdict != "no_mismatch" else None,
+        "found": found,
+        "at": at,
+    }
 
 
 def diagnose_concealed(options: Namespace) -> None:
@@ -83,57 +144,68 @@ def diagnose_concealed(options: Namespace) -> None:
     from bayessim_jax.recordings.shots import case_model
 
     jax.config.update("jax_enable_x64", True)
+    cases = draw_cases(options.rigs, options.cases, options.seed)
     done: dict[int, dict[str, Any]] = {}
     if options.out is not None and options.out.exists():
         rows = [json.loads(line) for line in options.out.read_text(encoding="utf-8").splitlines()]
         done = {row["case"]["seed"]: row for row in rows}
-    for case in draw_cases(options.rigs, options.cases, options.seed):
+    for case in cases:
         row = done.get(case["seed"])
         if row is None or row["case"] != case:
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder) / "case"
-                arguments = {k: case[k] for k in ("place", "strength", "seed", "velocities")}
-                make_case(path, case["rig"], case["effect"], **arguments)
+                try:
+                    sealed = make_drawn(path, case)
+                except StrengthError as error:
+                    print(f"{'not made':<12} {case['rig']} {error}", flush=True)
+                    continue
                 start = time.perf_counter()
                 model = case_model(load_case(path).check(), before=BEFORE_ROWS)
-                found = diagnose_case(jax.random.key(case["seed"]), model)
+                table = diagnose_case(jax.random.key(case["seed"]), model).table()
                 seconds = time.perf_counter() - start
-                table = found.table()
-            m = model.system.engine.model
-            joints, motors = [m.joint(i).name for i in range(m.njnt)], [m.actuator(i).name for i in range(m.nu)]
             row = {
                 "case": case,
+                "sealed": sealed,
                 "seconds": round(seconds, 1),
-                "outcome": judge(case, table, joints, motors),
+                **judge(sealed, table),
                 "verdict": table["verdict"],
-                "found": table["confusion_set"] or [[f"{e['effect']}@{e['at']}" for e in table["effects"]]],
                 "p_value": table["misfit"]["p_value"],
-                "place": table["locations"][0]["at"] if table["locations"] else "",
                 "nrmse": {k: v["nrmse"] for k, v in table["fit"].items() if isinstance(v, dict)},
                 "noise_floor": table["fit"]["noise_floor"],
-                "entries": [[e.names, round(e.score, 1)] for e in found.result.entries[:4]],
-                "left": [round(x, 4) for x in found.shares_left[:4]],
+                "parameters": table["parameters"],
+                "effects": table["effects"],
             }
             if options.out is not None:
                 with options.out.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(row) + "\n")
             jax.clear_caches()
         done[case["seed"]] = row
-        about = f"{case['rig']} {case['effect']} x{case['strength']:g} at {case['place']}"
-        print(f"{row['outcome']:<12} {about:<48} {row['found']} {row['seconds']:.0f} s", flush=True)
-    _summarize([done[case["seed"]] for case in draw_cases(options.rigs, options.cases, options.seed)])
+        hidden = ", ".join(f"{e['effect']}@{e['at']} {e['strength']['measured']:g}" for e in row["sealed"]["effects"])
+        print(
+            f"{row['outcome']:<12} {case['rig']} {hidden or 'clean'} -> {row['found']} {row['seconds']:.0f} s",
+            flush=True,
+        )
+    print("\n" + summarize([done[case["seed"]] for case in cases if case["seed"] in done]))
 
 
-def _summarize(rows: list[dict[str, Any]]) -> None:
-    groups = {
-        "clean": [r for r in rows if r["case"]["effect"] is None],
-        "in no library": [r for r in rows if r["case"]["effect"] in UNKNOWN],
-        "concealed": [r for r in rows if r["case"]["effect"] in CONCEALED],
-    }
-    print()
-    for name, members in groups.items():
-        if members:
-            outcomes = [r["outcome"] for r in members]
-            counts = ", ".join(f"{o} {outcomes.count(o)}" for o in sorted(set(outcomes)))
-            print(f"{name}: {len(members)} cases: {counts}")
-    print(f"seconds per case: median {np.median([r['seconds'] for r in rows]):.0f}")
+def summarize(rows: list[dict[str, Any]]) -> str:
+    """The scoreboard: one line for each group."""
+    lines = []
+    for group in GROUPS:
+        members = [row for row in rows if row["case"]["group"] == group]
+        if not members:
+            continue
+        outcomes = [row["outcome"] for row in members]
+        located = [row["joint"] for row in members if row["joint"] is not None]
+        parts = [f"{outcome} {outcomes.count(outcome)}" for outcome in sorted(set(outcomes))]
+        if group in ("single", "weak", "pair"):
+            parts.append(f"single best {sum(row['single_best'] for row in members)}")
+        if group == "pair":
+            parts.append(f"with a third {sum(row['third'] for row in members)}")
+        if located:
+            parts.append(f"joint right {sum(located)} of {len(located)}")
+        lines.append(f"{group:<8} {len(members):>4}: {', '.join(parts)}")
+    seconds = np.array([row["seconds"] for row in rows])
+    if len(seconds):
+        lines.append(f"seconds per case: median {np.median(seconds):.0f}, longest {seconds.max():.0f}")
+    return "\n".join(lines)

@@ -25,6 +25,7 @@ commands:
   check CASE      print what a case holds and what is wrong with it
   infer CASE      infer a model's parameters from recordings (bayessim infer --help)
   diagnose CASE   say whether physics is missing in a model, where and which (bayessim diagnose --help)
+  conceal MODEL   make a case in which an effect is hidden (bayessim conceal --help)
   evaluate RUN    score a diagnosis on other recordings (bayessim evaluate --help)
   report RUN      write the report of a run folder again
   systems         what can be identified: parameters, units, priors
@@ -34,7 +35,7 @@ options:
   --version       show the version
   --citations     BibTeX of what this package builds on (bayessim --citations RUN: of what that run used)
 """
-COMMANDS = ("online", "new", "check", "infer", "diagnose", "evaluate", "report", "systems")
+COMMANDS = ("online", "new", "check", "infer", "diagnose", "conceal", "evaluate", "report", "systems")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -84,6 +85,10 @@ def _dispatch(words: list[str]) -> int:
         from bayessim_jax.cli.diagnose import diagnose
 
         return diagnose(rest)
+    if first == "conceal":
+        from bayessim_jax.cli.conceal import conceal
+
+        return conceal(rest)
     if first == "evaluate":
         from bayessim_jax.cli.evaluate import evaluate
 

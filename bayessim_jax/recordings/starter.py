@@ -16,10 +16,10 @@ from bayessim_jax.recordings.paths import Target, element_names, nominal
 from bayessim_jax.recordings.wording import CaseError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
-__all__ = ["candidates", "start_case"]
+__all__ = ["candidates", "copy_model", "label_target", "parameter_text", "start_case", "toml_string"]
 
 HEAD = """\
 # What to simulate, what is unknown in it, and where the recordings are. Keep the parameters that are really unknown.
@@ -48,49 +48,72 @@ def start_case(folder: Path, model: Path) -> tuple[Path, list[str]]:
     if path.exists():
         raise CaseError(str(path), "is there already", "choose another folder, or remove it")
     root = folder if model.resolve().is_relative_to(folder.resolve()) else model.parent
-    files = referenced_files(model, root)
     compiled = compile_spec(read_spec(model, root), model)
     layout = layout_of_model(compiled)
+    name = copy_model(folder, model)
+    _written(folder, lambda: write_text(path, case_text(folder.resolve().name, name, compiled, layout)))
+    return path, [
+        f"{name}: {element} has no name; name it, so that recordings can refer to it." for element in layout.unnamed
+    ]
+
+
+def copy_model(folder: Path, model: Path) -> str:
+    """Make a case folder with room for recordings and copy a model into it, with what that refers to.
+
+    Returns where the model is, from the folder; a model that is in the folder already stays there. Raises `CaseError`
+    where it refers to files outside of its own folder, and where a file is there with another content.
+    """
+    root = folder if model.resolve().is_relative_to(folder.resolve()) else model.parent
+    files = referenced_files(model, root)
     copies = [] if root == folder else [(file, folder / file.resolve().relative_to(root.resolve())) for file in files]
     for source, place in copies:
         if place.exists() and place.read_bytes() != source.read_bytes():
             raise CaseError(str(place), "is there already and differs", "choose another folder, or remove it")
-    try:
+
+    def copy() -> None:
         (folder / "recordings").mkdir(parents=True, exist_ok=True)
         for source, place in copies:
             place.parent.mkdir(parents=True, exist_ok=True)
             if not place.exists():
                 shutil.copyfile(source, place)
-        name = str(model.resolve().relative_to(root.resolve()).as_posix())
-        write_text(path, case_text(folder.resolve().name, name, compiled, layout))
+
+    _written(folder, copy)
+    return str(model.resolve().relative_to(root.resolve()).as_posix())
+
+
+def _written(folder: Path, write: Callable[[], None]) -> None:
+    try:
+        write()
     except OSError as error:
         raise CaseError(str(folder), f"cannot be written ({error.strerror})", "choose another folder") from error
-    return path, [
-        f"{name}: {element} has no name; name it, so that recordings can refer to it." for element in layout.unnamed
-    ]
 
 
 def case_text(name: str, file: str, model: Any, layout: Layout) -> str:
     """The text of a starting `case.toml`."""
     channels = [("time", "s"), *((c, layout.units[c]) for c in layout.channels)]
     columns = "".join(
-        f"#   {_string(c)[1:-1]:<36} {_note(c, u, layout)}".rstrip() + "\n" for c, u in channels if "/#" not in c
+        f"#   {toml_string(c)[1:-1]:<36} {_note(c, u, layout)}".rstrip() + "\n" for c, u in channels if "/#" not in c
     )
-    example = _string(next(iter(layout.qpos), "time"))
-    text = HEAD.format(schema=SCHEMA, name=_string(name), model=_string(file), columns=columns, example=example)
+    example = toml_string(next(iter(layout.qpos), "time"))
+    text = HEAD.format(schema=SCHEMA, name=toml_string(name), model=toml_string(file), columns=columns, example=example)
     taken: set[str] = set()
     for target, low, high, likely in candidates(model):
         mark = "" if likely else "# "
-        label = _label(target, taken)
-        lines = [
-            "[[parameters]]",
-            f"name = {_string(label)}",
-            *([f"unit = {_string(_unit(target, layout))}"] if _unit(target, layout) else []),
-            f"targets = [{_string(str(target))}]   # {nominal(target, model):.6g} in the model",
-            f'prior = {{ distribution = "uniform", low = {low:.4g}, high = {high:.4g} }}',
-        ]
+        lines = parameter_text(target, label_target(target, taken), low, high, model, layout).splitlines()
         text += "\n" + "".join(f"{mark}{line}\n" for line in lines)
     return text
+
+
+def parameter_text(target: Target, label: str, low: float, high: float, model: Any, layout: Layout) -> str:
+    """One `[[parameters]]` of a `case.toml`, with a uniform prior."""
+    lines = [
+        "[[parameters]]",
+        f"name = {toml_string(label)}",
+        *([f"unit = {toml_string(_unit(target, layout))}"] if _unit(target, layout) else []),
+        f"targets = [{toml_string(str(target))}]   # {nominal(target, model):.6g} in the model",
+        f'prior = {{ distribution = "uniform", low = {low:.4g}, high = {high:.4g} }}',
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def candidates(model: Any) -> Iterator[tuple[Target, float, float, bool]]:
@@ -151,7 +174,8 @@ def _inertia(model: Any) -> np.ndarray:
     return diagonal
 
 
-def _label(target: Target, taken: set[str]) -> str:
+def label_target(target: Target, taken: set[str]) -> str:
+    """A name for a parameter that is not taken yet; it then is."""
     axis = "xyz"[target.index] if target.field == "ipos" and target.index is not None else ""
     words = {"mass": "mass", "ipos": f"com_{axis}", "frictionloss": "friction"}
     stem = re.sub(r"\W", "_", f"{target.name}_{words.get(target.field, target.field)}", flags=re.ASCII)
@@ -180,7 +204,7 @@ def _note(channel: str, unit: str, layout: Layout) -> str:
     return f"{unit}; estimated where it is not measured" if channel in layout.qvel else unit
 
 
-def _string(text: str) -> str:
+def toml_string(text: str) -> str:
     """A TOML string."""
     escaped = "".join(c if c.isprintable() and c not in '"\\' else f"\\u{ord(c):04x}" for c in text)
     return f'"{escaped}"'

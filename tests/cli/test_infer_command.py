@@ -17,33 +17,33 @@ from tests.browser import CHROMIUM, open_in_chromium
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("infer")
-    truth = make_case(folder / "rig", "slide", seed=2, recordings=3, seconds=2.0)
+    sealed = make_case(folder / "rig", "slide", seed=2, recordings=3, seconds=2.0)
     assert main(["infer", str(folder / "rig"), "--out", str(folder / "run"), "--quiet"]) == 0
-    return folder, truth
+    return folder, sealed
 
 
 def test_the_run_folder_holds_what_was_learned(run):
-    folder, truth = run
+    folder, sealed = run
     table = json.loads((folder / "run" / "inference.json").read_text())
-    mass = table["parameters"]["mass"]
+    mass = table["parameters"]["carriage_mass"]
     assert mass["q05"] < mass["mean"] < mass["q95"]
-    assert mass["mean"] == pytest.approx(truth["mass"], abs=6 * mass["sd"])
+    assert mass["mean"] == pytest.approx(sealed["parameters"]["carriage_mass"], abs=6 * mass["sd"])
     assert table["fit"]["posterior"]["nrmse"] < table["fit"]["baseline"]["nrmse"]
     assert set(table["fit"]["posterior"]["per_channel"]) == {"joint/rail/qpos", "joint/rail/qvel"}
     assert table["fit"]["held_out"] and table["identifiability"]["not_informed"] == []
     facts = json.loads((folder / "run" / "run.json").read_text())
     assert facts["status"] == "finished" and facts["seconds"] > 0
     with xr.open_datatree(folder / "run" / "posterior.nc", engine="h5netcdf") as tree:
-        draws = tree["posterior"]["mass"].values
+        draws = tree["posterior"]["carriage_mass"].values
         assert draws.shape == (1, 2000)
-        assert tree["posterior"]["mass"].attrs["units"] == "kg"
+        assert tree["posterior"]["carriage_mass"].attrs["units"] == "kg"
         assert draws.mean() == pytest.approx(mass["mean"], rel=1e-6)
         assert {"prior", "posterior", "posterior_predictive", "observed_data"} <= set(tree.children)
 
 
 def test_the_model_comes_out_with_the_mean_in_it(run):
     folder, _ = run
-    mean = json.loads((folder / "run" / "inference.json").read_text())["parameters"]["mass"]["mean"]
+    mean = json.loads((folder / "run" / "inference.json").read_text())["parameters"]["carriage_mass"]["mean"]
     model = mujoco.MjModel.from_xml_path(str(folder / "run" / "model_posterior.xml"))
     assert model.body("carriage").mass[0] == pytest.approx(mean, rel=1e-4)  # MuJoCo writes six digits
     models = sample_models(folder / "run", 5, seed=1)
@@ -68,7 +68,7 @@ def test_a_used_folder_and_slips_are_refused_in_one_line(run, capsys):
 def test_the_report_is_one_page_that_shows_everything(run):
     folder, _ = run
     page = (folder / "run" / "report.html").read_text()
-    assert "mass is" in page and page.count("<canvas") == 2 and page.count("<svg") >= 3
+    assert "carriage_mass is" in page and page.count("<canvas") == 2 and page.count("<svg") >= 3
     assert "http" not in page.replace("http://www.w3.org", "").replace("http-equiv", "")
 
 

@@ -24,10 +24,10 @@ def inferred(folder, seed=0, **options):
 
 
 def test_parameters_noise_and_predictions_of_a_pendulum(tmp_path):
-    truth = make_case(tmp_path / "rig", "pendulum", seed=3)
+    sealed = make_case(tmp_path / "rig", "pendulum", seed=3)
     result = inferred(tmp_path / "rig")
     draws = np.asarray(result.posterior.draws)
-    assert abs(draws.mean() - truth["mass"]) < 5 * draws.std() + 2e-4
+    assert abs(draws.mean() - sealed["parameters"]["rod_mass"]) < 5 * draws.std() + 2e-4
     assert draws.std() < 1e-3
     noise = dict(zip(result.model.channels, np.asarray(result.posterior.fit.sigma), strict=True))
     assert noise["joint/hinge/qpos"] == pytest.approx(1e-3, rel=0.15)
@@ -39,11 +39,11 @@ def test_parameters_noise_and_predictions_of_a_pendulum(tmp_path):
 
 
 def test_without_measured_velocities(tmp_path):
-    truth = make_case(tmp_path / "rig", "pendulum", seed=4, velocities=False)
+    sealed = make_case(tmp_path / "rig", "pendulum", seed=4, velocities=False)
     result = inferred(tmp_path / "rig")
     draws = np.asarray(result.posterior.draws)
     assert result.model.channels == ("joint/hinge/qpos",)
-    assert abs(draws.mean() - truth["mass"]) < 5 * draws.std() + 2e-4
+    assert abs(draws.mean() - sealed["parameters"]["rod_mass"]) < 5 * draws.std() + 2e-4
 
 
 def test_one_recording_is_split_by_windows(tmp_path):
@@ -72,7 +72,7 @@ def test_two_that_trade_off_are_a_ridge(tmp_path):
     text += 'prior = { distribution = "uniform", low = 0.5, high = 1.6 }\n'
     (folder / "case.toml").write_text(text)
     result = inferred(folder)
-    assert [set(r[:2]) for r in result.identifiability.ridges] == [{"mass", "gear"}]
+    assert [set(r[:2]) for r in result.identifiability.ridges] == [{"carriage_mass", "gear"}]
 
 
 def test_engines_agree_on_the_posterior(tmp_path):
@@ -115,9 +115,9 @@ def test_credible_sets_of_many_worlds_hold_the_truth_as_often_as_they_say(tmp_pa
     levels = []
     for seed in range(30):
         folder = tmp_path / f"rig{seed}"
-        truth = make_case(folder, "slide", seed=seed, recordings=2, seconds=2.0)
+        sealed = make_case(folder, "slide", seed=seed, recordings=2, seconds=2.0)
         draws = np.asarray(inferred(folder, seed).posterior.draws)[:, 0]
-        levels.append((draws < truth["mass"]).mean())
+        levels.append((draws < sealed["parameters"]["carriage_mass"]).mean())
         jax.clear_caches()  # every world compiles programs of its own
     central = np.abs(2 * np.array(levels) - 1)
     assert 0.25 <= (central < 0.5).mean() <= 0.75, sorted(central)

@@ -1,0 +1,199 @@
+"""Friction and drag at a joint."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from bayessim_jax.concealment.bristle import STIFF, Bristle
+from bayessim_jax.concealment.law import ForceLaw, Spot
+from bayessim_jax.concealment.places import driven_joints
+
+if TYPE_CHECKING:
+    from bayessim_jax.concealment.world import World
+
+__all__ = [
+    "AsymmetricFriction",
+    "CoulombFriction",
+    "LoadDependentFriction",
+    "LuGreFriction",
+    "QuadraticDrag",
+    "StribeckFriction",
+    "ViscousFriction",
+]
+
+
+@dataclass
+class ViscousFriction(ForceLaw):
+    """τ = −b v."""
+
+    name = "viscous_friction"
+    viscous: float
+
+    @classmethod
+    def make(cls, spot: Spot, amplitude: float, rng: np.random.Generator) -> ViscousFriction:
+        """B in units of the joint's force over its speed."""
+        return cls(spot, 2.0 * amplitude * spot.force / spot.speed)
+
+    def force(self, world: World, q: float, v: float) -> float:
+        """Against the velocity."""
+        return -self.viscous * v
+
+
+@dataclass
+class QuadraticDrag(ForceLaw):
+    """τ = −c v √(v² + ε²): c v|v| without its corner, ε 2 % of the joint's speed."""
+
+    name = "quadratic_drag"
+    coefficient: float
+
+    @classmethod
+    def make(cls, spot: Spot, amplitude: float, rng: np.random.Generator) -> QuadraticDrag:
+        """C in units of the joint's force over its speed squared."""
+        return cls(spot, 3.0 * amplitude * spot.force / spot.speed**2)
+
+    def force(self, world: World, q: float, v: float) -> float:
+        """Against the velocity."""
+        return -self.coefficient * v * math.hypot(v, 0.02 * self.spot.speed)
+
+
+@dataclass
+class CoulombFriction(ForceLaw):
+    """τ = −F_c sign(v) in motion, at rest what holds the joint: a stiff bristle that slips at F_c."""
+
+    name = "coulomb_friction"
+    coulomb: float
+
+    @classmethod
+    def make(cls, spot: Spot, amplitude: float, rng: np.random.Generator) -> CoulombFriction:
+        """F_c in units of the joint's force."""
+        return cls(spot, amplitude * spot.force)
+
+    def begin(self, world: World, rng: np.random.Generator) -> None:
+        """With a bristle that is not bent."""
+        self._bristle = Bristle(self.spot.inertia, world.h)
+
+    def force(self, world: World, q: float, v: float) -> float:
+        """The bristle's."""
+        return self._bristle.pull(v, self.coulomb, self.coulomb)
+
+
+@dataclass
+class StribeckFriction(ForceLaw):
+    """A stiff bristle that slips at g(v) = F_c + (F_s − F_c)/(1 + (v/v_s)²)."""
+
+    name = "stribeck_friction"
+    coulomb: float
+    static: float
+    velocity: float
+
+    @classmethod
+    def make(cls, spot: Spot, amplitude: float, rng: np.random.Generator) -> StribeckFriction:
+        """F_c in units of the joint's force, F_s 1.6 to 2.2 times as much, v_s 8 to 15 % of the joint's speed."""
+        coulomb = 0.8 * amplitude * spot.force
+        return cls(spot, coulomb, rng.uniform(1.6, 2.2) * coulomb, rng.uniform(0.08, 0.15) * spot.speed)
+
+    def begin(self, world: World, rng: np.random.Generator) -> None:
+        """With a bristle that is not bent."""
+        self._bristle = Bristle(self.spot.inertia, world.h)
+
+    def force(self, world: World, q: float, v: float) -> float:
+        """The bristle's."""
+        level = self.coulomb + (self.static - self.coulomb) / (1.0 + (v / self.velocity) ** 2)
+        return self._bristle.pull(v, level, level)
+
+
+@dataclass
+class AsymmetricFriction(ForceLaw):
+    """A stiff bristle that slips at F₊ where v > 0 and at F₋ where v < 0."""
+
+    name = "asymmetric_friction"
+    positive: float
+    negative: float
+
+    @classmethod
+    def make(cls, spot: Spot, amplitude: float, rng: np.random.Generator) -> AsymmetricFriction:
+        """One level in units of the joint's force, the other 30 to 60 % of it."""
+        large = 1.2 * amplitude * spot.force
+        small = rng.uniform(0.3, 0.6) * large
+        return cls(spot, *((large, small) if rng.uniform() < 0.5 else (small, large)))
+
+    def begin(self, world: World, rng: np.random.Generator) -> None:
+        """With a bristle that is not bent."""
+        self._bristle = Bristle(self.spot.inertia, world.h)
+
+    def force(self, world: World, q: float, v: float) -> float:
+        """The bristle's."""
+        return self._bristle.pull(v, self.negative, self.positive)
+
+
+@dataclass
+class LoadDependentFriction(ForceLaw):
+    """A stiff bristle that slips at F_c + K √(τ² + ε²), τ what the motors exert: ε 1 % of the joint's force."""
+
+    name = "load_dependent_friction"
+    coulomb: float
+    gain: float
+
+    @classmethod
+    def places(cls, model: mujoco.MjModel) -> list[str]:
+        """Every joint that is driven."""
+        return driven_joints(model)
+
+    @classmethod
+    def make(cls, spot: Spot, amplitude: float, rng: np.random.Generator) -> LoadDependentFriction:
+        """K, and F_c 15 to 40 % of K times the joint's force."""
+        return cls(spot, rng.uniform(0.15, 0.4) * amplitude * spot.force, amplitude)
+
+    def begin(self, world: World, rng: np.random.Generator) -> None:
+        """With a bristle that is not bent."""
+        self._bristle = Bristle(self.spot.inertia, world.h)
+
+    def force(self, world: World, q: float, v: float) -> float:
+        """The bristle's."""
+        level = self.coulomb + self.gain * math.hypot(world.motor(self.spot.joint), 0.01 * self.spot.force)
+        return self._bristle.pull(v, level, level)
+
+
+@dataclass
+class LuGreFriction(ForceLaw):
+    """τ = −(σ₀ z + σ₁ ż), ż = v − σ₀|v|z/g(v), g(v) = F_c + (F_s − F_c)/(1 + (v/v_s)²), integrated in closed form.
+
+    Soft enough that the bristles' bending is seen.
+
+    Source: Canudas de Wit, Olsson, Åström and Lischinsky 1995
+    """
+
+    name = "lugre_friction"
+    stiffness: float
+    damping: float
+    coulomb: float
+    static: float
+    velocity: float
+
+    @classmethod
+    def make(cls, spot: Spot, amplitude: float, rng: np.random.Generator) -> LuGreFriction:
+        """Levels as of Stribeck friction; σ₀ such that the bristles bend by 4 to 10 % of the joint's reach."""
+        coulomb = 0.8 * amplitude * spot.force
+        static, velocity = rng.uniform(1.3, 1.8) * coulomb, rng.uniform(0.08, 0.15) * spot.speed
+        stiffest = spot.inertia * (STIFF / spot.h) ** 2
+        stiffness = min(static / (rng.uniform(0.04, 0.1) * spot.reach), stiffest)
+        return cls(spot, stiffness, 0.6 * math.sqrt(stiffness * spot.inertia), coulomb, static, velocity)
+
+    def begin(self, world: World, rng: np.random.Generator) -> None:
+        """With bristles that are not bent."""
+        self._bend = 0.0
+
+    def force(self, world: World, q: float, v: float) -> float:
+        """The bristles'."""
+        if self.static <= 0.0:
+            return 0.0
+        level = self.coulomb + (self.static - self.coulomb) / (1.0 + (v / self.velocity) ** 2)
+        before, end = self._bend, math.copysign(level / self.stiffness, v)
+        decay = math.exp(-self.stiffness * abs(v) * world.h / level)
+        self._bend = end + (before - end) * decay
+        return -(self.stiffness * self._bend + self.damping * (self._bend - before) / world.h)
