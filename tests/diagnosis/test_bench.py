@@ -7,6 +7,7 @@ import pytest
 
 from bayessim_jax.diagnosis.bench import Candidate
 from bayessim_jax.diagnosis.procedure import Entry, Problem, Thresholds, _contains_another, _ties
+from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.effects import EFFECTS, Scales
 from bayessim_jax.inference.replay import replay_window
 from bayessim_jax.recordings.loading import load_case
@@ -29,6 +30,7 @@ def problem(tmp_path_factory):
     make_case(folder, "pendulum", "coulomb_friction", seed=3, recordings=2, seconds=2.0)
     model = case_model(load_case(folder).check(), before=10)
     windows = model.windows([0, 1])
+    inputs = model.inputs(windows)
     scales = {place: Scales(timestep=0.002, period=0.004) for _, place in PAIRS}
     pairs = tuple((EFFECTS[name], place) for name, place in PAIRS)
     yield Problem(
@@ -38,7 +40,13 @@ def problem(tmp_path_factory):
         scales,
         model.shots(windows),
         windows.recording,
-        np.ones(len(windows), bool),
+        Motion(
+            jnp.asarray(windows.qpos),
+            jnp.asarray(windows.qvel),
+            inputs.ctrl,
+            inputs.past,
+            inputs.time,
+        ),
     )
     jax.config.update("jax_enable_x64", False)
 
@@ -90,7 +98,7 @@ def test_the_concealed_effect_lowers_the_cost_most(problem):
 
 
 def entry(names, scores):
-    return Entry(Candidate(), names, None, np.asarray(scores, float), None, np.ones(1))
+    return Entry(Candidate(), names, None, np.asarray(scores, float), None, np.ones((1, 1)))
 
 
 def test_a_special_case_wins_over_what_contains_it():
@@ -104,9 +112,23 @@ def test_a_special_case_wins_over_what_contains_it():
 def test_ties_are_within_the_error_of_the_difference():
     rng = np.random.default_rng(0)
     best = entry(["a@x"], rng.normal(100, 1, 30))
-    chosen = np.ones(30, bool)
     same, worse = entry(["b@x"], rng.normal(100, 1, 30)), entry(["c@x"], best.scores - 20)
-    lost = entry(["d@x"], best.scores - np.where(np.arange(30) == 3, 1e6, 5.0))
-    assert _ties(same, best, chosen, Thresholds())
-    assert not _ties(worse, best, chosen, Thresholds())
-    assert not _ties(lost, best, chosen, Thresholds())
+    assert _ties(same, best, Thresholds())
+    assert not _ties(worse, best, Thresholds())
+
+
+def test_the_concealed_effect_comes_out_first_along_the_motion(problem):
+    screen = problem.screen(problem.pairs)
+    nothing = screen.begin(jnp.array([0.0]), jnp.array([0.02, 0.2]))
+    random = np.random.default_rng(0)
+    found = [screen.try_candidate(Candidate((k,)), nothing, random) for k in range(len(problem.pairs))]
+    scores = [item.score - nothing.score for item in found]
+    assert int(np.argmax(scores)) in (0, 1)
+    assert max(scores[2:]) < 0.5 * scores[0]
+    level = screen.margin[0][0].value(found[0].p[screen.d])
+    bench = problem.bench(problem.pairs)
+    fit = bench.fit(
+        Candidate((0,)), found[0].p, jnp.zeros((len(problem.group), 2)), found[0].sigma, problem.shots.measured
+    )
+    simulated = bench.values(Candidate((0,)), fit.z)["coulomb_friction@joint/hinge/coulomb"]
+    assert float(level) == pytest.approx(simulated, rel=0.05)

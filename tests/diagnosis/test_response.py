@@ -1,0 +1,133 @@
+"""The linear response around a motion is that of the simulator, and effects do along it what they do in it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bayessim_jax.diagnosis.forcing import Joint, commands_of, force_of, restore_readings
+from bayessim_jax.diagnosis.response import Forcing, Motion, Windowed, assess, linearize_steps, separate
+from bayessim_jax.effects import EFFECTS, Moment
+from bayessim_jax.systems.mjcf import displace, mjcf_system
+
+DOUBLE = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+<body><joint name="a" axis="0 1 0" damping="0.02"/><inertial pos="0 0 -0.2" mass="0.5" diaginertia="0.004 0.004 0.001"/>
+<body pos="0 0 -0.4"><joint name="b" axis="0 1 0"/><inertial pos="0 0 -0.1" mass="0.3" diaginertia="0.002 0.002 0.001"/>
+</body></body></worldbody><actuator><motor joint="a"/></actuator></mujoco>"""
+FREE = """<mujoco><worldbody><body><freejoint/><geom size="0.1" mass="1"/></body></worldbody></mujoco>"""
+STEPS = 30
+
+
+@pytest.fixture(autouse=True)
+def double_precision():
+    jax.config.update("jax_enable_x64", True)
+    yield
+    jax.config.update("jax_enable_x64", False)
+
+
+@pytest.fixture
+def arm():
+    return mjcf_system(DOUBLE, [], substeps=2)
+
+
+def simulate(system, qpos, qvel, ctrl, forces):
+    """Positions and velocities of all rows under held forces."""
+    state = system.begin(jnp.zeros(0), qpos, qvel)
+    rows = [jnp.concatenate([qpos, qvel])]
+    for u, f in zip(ctrl, forces, strict=True):
+        state = system.advance(jnp.zeros(0), state, u, f, system.substeps)
+        rows.append(jnp.concatenate([system.positions(state), system.velocities(state)]))
+    return jnp.stack(rows)
+
+
+def test_the_response_to_a_force_is_the_simulators_to_first_order(arm):
+    ctrl = 0.3 * jnp.sin(jnp.arange(STEPS))[:, None]
+    push = jnp.stack([jnp.cos(jnp.arange(STEPS) / 5.0), jnp.sin(jnp.arange(STEPS) / 7.0)], -1)
+    start = jnp.array([0.6, -0.4]), jnp.array([1.0, -2.0])
+    plain = simulate(arm, *start, ctrl, jnp.zeros((STEPS, 2)))
+    motion = Motion(plain[None, :, :2], plain[None, :, 2:], ctrl[None], jnp.zeros((1, 0, 1)), jnp.zeros(1))
+    lin = linearize_steps(arm.engine, lambda x: x, motion, jnp.zeros(0), jnp.zeros((1, 0)), 2, 0.0)
+    np.testing.assert_allclose(lin.gap, 0.0, atol=1e-10)
+    errors = []
+    for size in (1e-2, 1e-3):
+        moved = simulate(arm, *start, ctrl, size * push)
+        seen = Windowed(
+            moved[None],
+            jnp.ones((1, STEPS + 1, 4), bool),
+            plain[None],
+            jnp.eye(4) * jnp.ones((1, STEPS + 1, 1, 1)),
+            jnp.ones(4),
+        )
+        none = jnp.zeros((1, STEPS + 1, 4))
+        forcing = Forcing(size * push[None], jnp.zeros((1, STEPS, 2, 1)), none + 1.0, none, none[..., None])
+        _, r, _ = assess(lin, seen, forcing, jnp.zeros(1), jnp.zeros(1), jnp.zeros((1, 4)), jnp.ones(4))
+        errors.append(float(jnp.abs(r).max() / jnp.abs(moved - plain).max()))
+    assert errors[1] < 1e-3
+    assert errors[1] < 0.2 * errors[0]
+
+
+def test_slopes_of_the_response_are_those_of_finite_differences(arm):
+    rng = np.random.default_rng(0)
+    qpos, qvel = (jnp.asarray(rng.normal(0, 0.1, (1, STEPS + 1, 2)).cumsum(1)) for _ in range(2))
+    motion = Motion(qpos, qvel, jnp.zeros((1, STEPS, 1)), jnp.zeros((1, 0, 1)), jnp.zeros(1))
+    forward = linearize_steps(arm.engine, lambda x: x, motion, jnp.zeros(0), jnp.zeros((1, 0)), 2, 0.0)
+    central = linearize_steps(arm.engine, lambda x: x, motion, jnp.zeros(0), jnp.zeros((1, 0)), 2, 1e-5)
+    for one, other in ((forward.a, central.a), (forward.b, central.b), (forward.gap, central.gap)):
+        np.testing.assert_allclose(one, other, atol=1e-6)
+
+
+def test_separate_is_the_inverse_of_displace():
+    model = mjcf_system(FREE, []).engine.model
+    rng = np.random.default_rng(1)
+    turn = rng.normal(size=4)
+    qpos = jnp.asarray(np.concatenate([rng.normal(size=3), turn / np.linalg.norm(turn)]))
+    move = jnp.asarray(1e-3 * rng.normal(size=6))
+    np.testing.assert_allclose(separate(model, qpos, displace(model, qpos, move)), move, atol=1e-8)
+
+
+def along(velocity):
+    n = velocity.shape[1]
+    still = jnp.zeros_like(velocity)
+    return 0.002 * jnp.arange(n)[None], Joint(still, velocity, still, still + 0.1, still + 0.5)
+
+
+def test_friction_along_a_motion_opposes_it_and_grows_with_its_level():
+    velocity = jnp.linspace(-3.0, 3.0, 40)[None]
+    time, joint = along(velocity)
+    low, high = jnp.array([0.0]), jnp.array([1.0])
+    kinds = (("coulomb", "uniform"),)
+    effect = EFFECTS["coulomb_friction"]
+    force, slopes = force_of(effect, kinds, "", 0.002, 2, jnp.zeros(1), low, high, time, joint, None)
+    assert force.shape == (1, 20) and slopes.shape == (1, 20, 1)
+    rows = np.asarray(velocity[0]).reshape(20, 2).mean(1)
+    moving = np.abs(rows) > 0.5
+    np.testing.assert_allclose(np.asarray(force[0])[moving], -0.5 * np.sign(rows[moving]), rtol=1e-6)
+    beside = force_of(effect, kinds, "", 0.002, 2, jnp.full(1, 1e-5), low, high, time, joint, None)[0]
+    np.testing.assert_allclose((beside - force)[0] / 1e-5, slopes[0, :, 0], rtol=1e-3, atol=1e-6)
+
+
+def test_a_lag_along_the_commands_is_the_difference_of_two_equations():
+    commands = jnp.ones((1, 60, 1)).at[:, :20].set(0.0)
+    time, joint = along(jnp.zeros((1, 60)))
+    kinds = (("time_constant", "uniform"),)
+    low, high, x = jnp.array([0.0]), jnp.array([0.08]), jnp.zeros(1)
+    effect = EFFECTS["actuator_lag"]
+    changes, _ = commands_of(effect, kinds, 0.002, 2, 20, x, low, high, time, joint, commands, jnp.asarray(1.0))
+    assert changes.shape == (1, 20, 1)
+    after = 0.002 * (np.arange(40).reshape(20, 2).mean(1) + 0.5)
+    np.testing.assert_allclose(changes[0, :, 0], -np.exp(-after / 0.04), atol=2e-3)
+
+
+def test_a_scaled_sensor_is_undone_with_its_derivatives():
+    q = jnp.linspace(-1.0, 1.0, 11)[None]
+    still = jnp.zeros_like(q)
+    low, high = jnp.array([0.5]), jnp.array([2.0])
+    kinds, x = (("scale", "uniform"),), jnp.zeros(1)
+    true, _, along_x, slope = restore_readings(
+        EFFECTS["sensor_scale"], kinds, 0.004, x, low, high, still, q, still, still, still
+    )
+    np.testing.assert_allclose(true, q / 1.25, rtol=1e-10)
+    np.testing.assert_allclose(slope, 1 / 1.25, rtol=1e-10)
+    density = 1.5 / np.sqrt(2 * np.pi)
+    np.testing.assert_allclose(along_x[..., 0], -q / 1.25**2 * density, rtol=1e-6)
+    assert Moment(still, 0.1).position == 0.0
