@@ -22,7 +22,17 @@ from bayessim_jax.inference.direct import noise_floor
 from bayessim_jax.inference.shooting import Fit, Shots
 from bayessim_jax.systems.mjcf import MjcfSystem
 
-__all__ = ["CONTAINS", "Diagnosis", "Entry", "Problem", "Thresholds", "detect", "name_effects", "share_left"]
+__all__ = [
+    "CONTAINS",
+    "Diagnosis",
+    "Entry",
+    "Problem",
+    "Thresholds",
+    "detect",
+    "is_mismatch",
+    "name_effects",
+    "share_left",
+]
 
 CONTAINS = {
     "stribeck_friction": ("coulomb_friction",),
@@ -59,7 +69,7 @@ class Thresholds:
     """What decides."""
 
     negligible: float = 0.02
-    """Share of the baseline's residual variance: what a candidate that removes less is not worth."""
+    """Power of a misfit over that of the noise, below which it is none."""
     left: float = 0.05
     """Share of the baseline's misfit that an explanation may leave."""
     tie: float = 2.0
@@ -78,8 +88,6 @@ class Entry:
     scores: Float[np.ndarray, " windows"]
     """Log predictive density of every window, its initial state profiled out."""
     misfit: Misfit
-    squares: Float[np.ndarray, "windows obs"]
-    """Mean squares of residuals that the fit has not seen."""
 
     @property
     def score(self) -> float:
@@ -147,7 +155,7 @@ class _Work:
         free = self.bench.d + len(self.bench.columns(candidate))
         for _ in range(rounds):
             r = np.asarray(self.bench.look(candidate, fit, self.mask())[0])
-            kept = self.followed(r, fit.sigma, which)
+            kept = self.followed(r, fit.sigma, which) if candidate.effects else which
             sigma = self.noise(r, kept, free)
             change = float(jnp.abs(jnp.log(sigma / fit.sigma)).max())
             fit = self.bench.fit(candidate, fit.z, fit.delta, sigma, self.mask(kept), steps=steps)
@@ -188,13 +196,25 @@ class Problem:
         return Bench(self.system, self.margins, pairs, self.scales, self.shots, self.step, slots)
 
 
-def detect(key: PRNGKeyArray, problem: Problem, baseline: Fit) -> tuple[Bench, Entry]:
-    """The simulator without effects, tested for a mismatch from its fit to the problem's windows."""
+def detect(
+    key: PRNGKeyArray, problem: Problem, baseline: Fit, known: Float[np.ndarray, "windows rows obs"] | float = 0.0
+) -> tuple[Bench, Entry]:
+    """The simulator without effects, tested for a mismatch from its fit to the problem's windows.
+
+    `known` is what is known of its errors: what they explain is no mismatch.
+    """
     nothing, bench = Candidate(), problem.bench(())
     work = _Work(key, bench, problem.group, noise_floor(bench.shots), _quiet)
     x = bench.starts(nothing, baseline.z)[0]
     fit = bench.fit(nothing, x, baseline.delta, baseline.sigma, work.mask(), steps=8)
-    return bench, _enter(work, nothing, work.settle(nothing, fit, np.ones(len(problem.group), bool)))
+    return bench, _enter(work, nothing, work.settle(nothing, fit, np.ones(len(problem.group), bool)), known=known)
+
+
+def is_mismatch(problem: Problem, detected: Entry, thresholds: Thresholds | None = None) -> bool:
+    """Whether the simulator's misfit is neither chance nor too small against the noise to matter."""
+    thresholds = thresholds or Thresholds()
+    size = detected.misfit.size(np.asarray(problem.shots.measured))
+    return detected.misfit.p_value < FALSE_ALARMS and size > thresholds.negligible
 
 
 def name_effects(
@@ -331,13 +351,15 @@ def _finish(work: _Work, none: Entry, candidates: Sequence[Screened]) -> list[En
     return sorted(entries, key=lambda entry: -entry.score)
 
 
-def _enter(work: _Work, candidate: Candidate, fit: Fit, folds: int = FOLDS) -> Entry:
+def _enter(
+    work: _Work, candidate: Candidate, fit: Fit, folds: int = FOLDS, known: Float[np.ndarray, "..."] | float = 0.0
+) -> Entry:
     """Score a candidate on windows that its fit has not seen, recording by recording or in as many folds."""
     bench, group = work.bench, work.group
     units = group if len(set(group.tolist())) > 1 else np.arange(len(group))
     labels = sorted(set(units.tolist()))
     measured = np.asarray(bench.shots.measured)
-    scores, left = np.zeros(len(group)), np.zeros(measured.shape)
+    scores = np.zeros(len(group))
     for part in [labels[i::folds] for i in range(min(folds, len(labels)))]:
         out = np.isin(units, part)
         kept = ~out if not out.all() else out
@@ -348,12 +370,10 @@ def _enter(work: _Work, candidate: Candidate, fit: Fit, folds: int = FOLDS) -> E
         sigma = np.asarray(trained.sigma)
         logs = np.where(measured, -0.5 * (r / sigma) ** 2 - np.log(sigma), 0.0)
         scores = np.where(out, logs.sum((1, 2)), scores)
-        left = np.where(out[:, None, None], r, left)
     misfit_key = jax.random.fold_in(work.key, sum(2**k for k in candidate.effects) % (2**31))
     residual, slopes = bench.look(candidate, fit, work.mask())
-    misfit = judge_misfit(misfit_key, np.asarray(residual), slopes, measured)
-    sizes = (np.where(measured, left, 0.0) ** 2).sum(1) / np.maximum(measured.sum(1), 1)
-    return Entry(candidate, bench.names(candidate), fit, scores, misfit, sizes)
+    misfit = judge_misfit(misfit_key, np.asarray(residual), slopes, measured, known)
+    return Entry(candidate, bench.names(candidate), fit, scores, misfit)
 
 
 def share_left(after: Misfit, before: Misfit) -> float:
@@ -376,10 +396,7 @@ def _decide(
     if not entries:
         return result
     best = entries[0]
-    kept = np.argsort(best.squares.sum(1))[: max(round((1 - TRIMMED) * len(best.squares)), 1)]
-    removed = 1 - float((best.squares[kept].sum(0) / np.maximum(none.squares[kept].sum(0), 1e-300)).min())
-    if removed < thresholds.negligible or best.score - none.score < thresholds.least:
-        result.verdict = "no_mismatch"
+    if best.score - none.score < thresholds.least:
         return result
     tied = [entry for entry in entries if _ties(entry, best, thresholds)]
     fewest = min(len(entry.candidate.effects) for entry in tied)

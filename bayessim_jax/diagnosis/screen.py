@@ -45,8 +45,12 @@ __all__ = ["Screen", "Screened"]
 FINE = 4
 """Most time steps in a row at which effects are evaluated."""
 ITERATIONS = 6
+BEGINNING, KEPT, LASTING = 4, 2, 10
+"""Steps of the solver from every point that a candidate is begun from, how many go on, and their further steps."""
 MOVED = 0.15
 """Of θ's z: how far it may move before the steps are linearized anew."""
+MOMENTS, CLOCK = 8, 2.0
+"""Times that are tried for what happens at some time; a parameter in s that may be so many windows long is a time."""
 DRAWS = 3
 """Points of its prior from which a candidate of several parameters is begun, beside the usual ones."""
 
@@ -109,6 +113,11 @@ class Screen:
         """Parameters of the system."""
         return self.margins.size
 
+    @property
+    def length(self) -> float:
+        """Of a window, s."""
+        return self.motion.ctrl.shape[1] * self.system.dt
+
     def count(self, candidate: Candidate) -> int:
         """Parameters of a candidate."""
         return sum(len(self.parameters[k]) for k in candidate.effects)
@@ -142,7 +151,15 @@ class Screen:
         points = [begin]
         if any(p.low < 0.0 for p, _ in each):
             points.append(-begin)
-        if len(each) > 1:
+        clocks = [k for k, (p, _) in enumerate(each) if p.unit == "s" and p.high > CLOCK * self.length]
+        for centre in np.linspace(0.0, 1.0, MOMENTS + 2)[1:-1] if clocks else ():
+            point = begin.copy()
+            for i, k in enumerate(clocks):
+                p, m = each[k]
+                when = centre + (2 * i - len(clocks) + 1) / (2 * MOMENTS)
+                point[k] = float(m.standard(jnp.asarray(p.low + when * (p.high - p.low), float)))
+            points.append(point)
+        if len(each) > 1 and not clocks:
             points += [0.7 * random.standard_normal(len(each)) for _ in range(DRAWS)]
         return points
 
@@ -204,14 +221,18 @@ class Screen:
     def try_candidate(self, candidate: Candidate, known: Screened, random: np.random.Generator) -> Screened | None:
         """A candidate's best fit, begun from a fit without it; `known` may hold some of its effects already."""
         held = dict(self.offsets(known.candidate))
-        best: tuple[Any, ...] | None = None
         added = Candidate(tuple(k for k in candidate.effects if k not in held))
+        own, found = dict(self.offsets(added)), []
         for start in self.starts(added, random):
-            p = self._put(candidate, known, held, dict(self.offsets(added)), start)
-            found = self.fit(candidate, p, known.delta, known.sigma, 4)
-            if found[2] is not None and (best is None or float(found[2].cost) < float(best[2].cost)):
-                best = found
-        return None if best is None else self.settle(candidate, best[0], best[1], known.sigma)
+            p = self._put(candidate, known, held, own, start)
+            found.append(self.fit(candidate, p, known.delta, known.sigma, BEGINNING))
+        found = sorted((f for f in found if f[2] is not None), key=lambda f: float(f[2].cost))[:KEPT]
+        ends = [self.fit(candidate, f[0], f[1], known.sigma, LASTING) for f in found]
+        ends = [end for end in ends if end[2] is not None]
+        if not ends:
+            return None
+        best = min(ends, key=lambda end: float(end[2].cost))
+        return self.settle(candidate, best[0], best[1], known.sigma)
 
     def misfit(self, key: PRNGKeyArray, found: Screened) -> Misfit:
         """What a candidate leaves of the misfit."""

@@ -2,7 +2,7 @@
 
 The statistic is the power of the residuals in the slowest cosines of every window, in units of the noise that their
 second differences show. Its null distribution needs no simulation: what a fit leaves of white noise is the noise minus
-its projection on everything that θ and the initial states can absorb, to first order.
+its projection on what the initial states can absorb, to first order; the few numbers of θ hardly count beside them.
 
 Source: von Neumann 1941 (noise from differences); Davison and Hinkley 1997 (parametric bootstrap)
 """
@@ -35,10 +35,9 @@ class Misfit:
     noise: Float[np.ndarray, " obs"]
     """White noise of each channel."""
 
-    @property
-    def total(self) -> float:
-        """Sum of the excess."""
-        return float(self.excess.sum())
+    def size(self, measured: Bool[np.ndarray, "windows rows obs"]) -> float:
+        """Power of the misfit over that of the noise, over all that was measured."""
+        return float(self.excess.sum() / max(measured.sum(), 1))
 
 
 def difference_noise(residual: Float[np.ndarray, "windows rows obs"], measured: Bool[np.ndarray, "..."]) -> np.ndarray:
@@ -62,14 +61,14 @@ def _slow(r: Array, cosines: Array) -> Array:
 
 
 @jax.jit
-def _null(keys: Any, slopes: Array, measured: Array, cosines: Array) -> Float[Array, "draws windows obs"]:
+def _null(keys: Any, slopes: Array, measured: Array, cosines: Array, known: Array) -> Float[Array, "draws windows obs"]:
     """Slow power of what a fit leaves of white noise."""
     windows, _, k = slopes.shape
     shape = measured.shape
     q, _ = jnp.linalg.qr(jnp.swapaxes(slopes, 1, 2))  # what each window can absorb by itself
 
     def one(key: Any) -> Array:
-        noise = jnp.where(measured, jax.random.normal(key, shape, slopes.dtype), 0.0).reshape(windows, k)
+        noise = jnp.where(measured, known + jax.random.normal(key, shape, slopes.dtype), 0.0).reshape(windows, k)
         left = noise - jnp.einsum("wkc,wc->wk", q, jnp.einsum("wkc,wk->wc", q, noise))
         return _slow(left.reshape(shape), cosines)
 
@@ -81,13 +80,25 @@ def judge_misfit(
     residual: Float[np.ndarray, "windows rows obs"],
     slopes: Float[Array, "windows n k"],
     measured: Bool[np.ndarray, "windows rows obs"],
+    known: Float[np.ndarray, "windows rows obs"] | float = 0.0,
 ) -> Misfit:
-    """Test the residuals of a fit against those of white noise; `slopes` are those of predictions along δ."""
+    """Test the residuals of a fit against those of white noise; `slopes` are those of predictions along δ.
+
+    `known` is an error that predictions have for another reason, such as the time step.
+    """
     noise = np.maximum(difference_noise(residual, measured), 1e-300)
     rows, obs = measured.shape[1:]
     slopes = (slopes.reshape(*slopes.shape[:2], rows, obs) / noise).reshape(slopes.shape)
     cosines = jnp.asarray(_cosines(rows))
-    null = np.asarray(_null(jax.random.split(key, BOOTSTRAPS), slopes, jnp.asarray(measured), cosines))
+    null = np.asarray(
+        _null(
+            jax.random.split(key, BOOTSTRAPS),
+            slopes,
+            jnp.asarray(measured),
+            cosines,
+            jnp.asarray(known / noise * np.ones(measured.shape)),
+        )
+    )
     scaled = jnp.asarray(np.where(measured, residual / noise, 0.0))
     power = np.asarray(_slow(scaled, cosines))
     expected = null.mean(0)

@@ -36,10 +36,6 @@ class Errors:
     diverged: int = 0
     """Windows whose simulation was not finite: counted, and in no average."""
 
-    def take(self, windows: Any) -> Errors:
-        """Some of the windows."""
-        return Errors(self.error[windows], self.measured[windows], self.diverged)
-
 
 @dataclass(frozen=True)
 class Score:
@@ -58,9 +54,12 @@ class Score:
         return {"nrmse": self.nrmse, "log_score": self.log_score, "per_channel": self.per_channel}
 
 
-def predict_windows(predict: Predict, shots: Shots, z: Float[Array, " d"]) -> Float[np.ndarray, "windows rows obs"]:
-    """Predictions of every window from its recorded initial state."""
-    return np.asarray(_predict(predict, shots.inputs, z, jnp.zeros((shots.y.shape[0], shots.spread.size))))
+def predict_windows(
+    predict: Predict, shots: Shots, z: Float[Array, " d"], delta: Float[Array, "windows n"] | None = None
+) -> Float[np.ndarray, "windows rows obs"]:
+    """Predictions of every window from its recorded initial state, or from δ beside it."""
+    delta = jnp.zeros((shots.y.shape[0], shots.spread.size)) if delta is None else delta
+    return np.asarray(_predict(predict, shots.inputs, z, delta))
 
 
 def _predict_all(predict: Predict, inputs: Any, z: Array, delta: Array) -> Array:

@@ -21,16 +21,16 @@ from bayessim_jax.diagnosis.procedure import (
     Problem,
     Thresholds,
     detect,
+    is_mismatch,
     name_effects,
     share_left,
 )
 from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.diagnosis.screen import Screened
-from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS
 from bayessim_jax.effects import EFFECTS, Scales, effect_places, recorded_scales
 from bayessim_jax.inference.scores import Score, compare, error_spread, score
-from bayessim_jax.inference.shooting import Fit, Shots
-from bayessim_jax.recordings.identification import channel_scale, settle_step, start_spread
+from bayessim_jax.inference.shooting import Shots
+from bayessim_jax.recordings.identification import Settled, channel_scale, settle_step, start_spread
 from bayessim_jax.recordings.shots import CaseModel, split_windows, take
 from bayessim_jax.recordings.smoothing import smooth_recordings
 from bayessim_jax.recordings.windows import Windows, cut_windows
@@ -191,14 +191,15 @@ class _Taken:
     """Windows as long as the horizon, by which a mismatch is detected."""
     problem: Problem
     """Pieces of them, by which it is named."""
-    baseline: Fit
+    settled: Settled
 
 
 def _take_case(key: Array, model: CaseModel, *, say: Callable[[str], None] = lambda text: None) -> _Taken:
     """Windows, smoothed motion, every registered effect at every place, and the fit without effects."""
     split = [_thin(part, most) for part, most in zip(split_windows(model), (MOST_FITTED, MOST_HELD), strict=True)]
     fitted, held = split
-    model, fit = settle_step(key, model, fitted, say=say)
+    settled = settle_step(key, model, fitted, say=say)
+    model = settled.model
     windows = join(fitted, held)
     system: Any = model.system
     pairs = tuple((effect, place) for effect in EFFECTS.values() for place in effect_places(effect, system))
@@ -217,7 +218,7 @@ def _take_case(key: Array, model: CaseModel, *, say: Callable[[str], None] = lam
         step=model.step,
     )
     problem = dataclasses.replace(whole, shots=model.shots(pieces), group=pieces.recording)
-    return _Taken(model, windows, np.arange(len(windows)) < len(fitted), pieces, whole, problem, fit)
+    return _Taken(model, windows, np.arange(len(windows)) < len(fitted), pieces, whole, problem, settled)
 
 
 def _motion(model: CaseModel, windows: Windows, smooth: Windows) -> Motion:
@@ -265,10 +266,10 @@ def diagnose_case(
     taken = _take_case(fit_key, model, say=say)
     model, windows, chosen = taken.model, taken.windows, taken.chosen
     say(f"{int(chosen.sum())} windows choose, {int((~chosen).sum())} judge")
-    plain, none = detect(key, taken.whole, taken.baseline)
+    plain, none = detect(key, taken.whole, taken.settled.fit, taken.settled.error)
     say(f"no mismatch has p = {none.misfit.p_value:.3f}")
     residual = None
-    if none.misfit.p_value >= FALSE_ALARMS:
+    if not is_mismatch(taken.whole, none, thresholds):
         result = Diagnosis("no_mismatch", plain, none, [])
     else:
         result = name_effects(key, taken.problem, none, thresholds=thresholds, say=say)

@@ -15,12 +15,20 @@ from jaxtyping import Array, Float
 from bayessim_jax.inference.direct import DirectPosterior, fit_direct, sample_direct
 from bayessim_jax.inference.identifiability import Identifiability, find_unidentified
 from bayessim_jax.inference.replay import Restarted
-from bayessim_jax.inference.scores import Score, error_spread, predict_windows, prediction_errors, score, smallest_error
+from bayessim_jax.inference.scores import (
+    Score,
+    compare,
+    error_spread,
+    predict_windows,
+    prediction_errors,
+    score,
+    smallest_error,
+)
 from bayessim_jax.inference.shooting import Fit, Shots, ridge
 from bayessim_jax.recordings.shots import CaseModel, case_model, predictor, split_windows
 from bayessim_jax.recordings.windows import Windows
 
-__all__ = ["CaseInference", "channel_scale", "infer_case", "settle_step", "start_spread"]
+__all__ = ["CaseInference", "Settled", "channel_scale", "infer_case", "settle_step", "start_spread"]
 
 DRAWS = 2000
 BAND = 24
@@ -119,7 +127,8 @@ def infer_case(
     fit_key, draw_key = jax.random.split(key)
     fitted, held = split_windows(model)
     say(f"fitting {len(fitted)} windows of {model.case.case.horizon:g} s; {len(held)} are kept to judge by")
-    model, fit = settle_step(fit_key, model, fitted, say=say)
+    settled = settle_step(fit_key, model, fitted, say=say)
+    model, fit = settled.model, settled.fit
     predict, shots, left = predictor(model), model.shots(fitted), model.shots(held)
     say("sampling the posterior")
     posterior = sample_direct(draw_key, predict, shots, model.margins, fit, draws=draws, step=model.step, exact=exact)
@@ -131,7 +140,8 @@ def infer_case(
     for name, z in points.items():
         predictions[name] = predict_windows(predict, left, z)
         spread = error_spread(prediction_errors(predict, shots, z), scale)
-        scores[name] = score(prediction_errors(predict, left, z), spread, scale, model.channels)
+        judged = compare(predictions[name], np.asarray(left.y), np.asarray(left.measured))
+        scores[name] = score(judged, spread, scale, model.channels)
     band = np.stack([predict_windows(predict, left, z) for z in posterior.z[:: max(draws // BAND, 1)][:BAND]])
     around = ridge(predict, shots, fit, step=model.step)
     return CaseInference(
@@ -147,9 +157,19 @@ def infer_case(
     )
 
 
+@dataclass(frozen=True)
+class Settled:
+    """A case on a time step that its recordings can bear, and its fit."""
+
+    model: CaseModel
+    fit: Fit
+    error: Float[np.ndarray, "windows rows obs"]
+    """About what the time step of the simulation does to predictions, in the channels' units."""
+
+
 def settle_step(
     key: Array, model: CaseModel, windows: Windows, *, say: Callable[[str], None] = lambda text: None
-) -> tuple[CaseModel, Fit]:
+) -> Settled:
     """Fit a case, on the model's own time step or, where that explains the recordings better, on a finer one.
 
     An integration error looks like missing physics. Where the error of the model's time step is of the size of the
@@ -158,27 +178,25 @@ def settle_step(
     predict, shots = predictor(model), model.shots(windows)
     fit = fit_direct(key, predict, shots, model.margins.size, step=model.step, say=say)
     if isinstance(model.system, Restarted):
-        return model, fit
+        return Settled(model, fit, np.zeros(shots.y.shape))
     finer = case_model(model.case, engine=model.engine_name, before=model.before, refined=REFINED * model.refined)
-    coarse = _simulated(predict, shots.inputs, fit.z, fit.delta)
-    fine = _simulated(predictor(finer), shots.inputs, fit.z, fit.delta)
-    error = np.where(np.asarray(shots.measured), np.asarray(coarse - fine) / np.asarray(fit.sigma), 0.0)
-    size = float(np.sqrt((error**2).sum((0, 1)) / np.maximum(np.asarray(shots.measured).sum((0, 1)), 1)).max())
+    coarse = predict_windows(predict, shots, fit.z, fit.delta)
+    fine = predict_windows(predictor(finer), shots, fit.z, fit.delta)
+    error = np.where(np.asarray(shots.measured) & np.isfinite(coarse - fine), coarse - fine, 0.0)
+    counts = np.maximum(np.asarray(shots.measured).sum((0, 1)), 1)
+    size = float((np.sqrt((error**2).sum((0, 1)) / counts) / np.asarray(fit.sigma)).max())
     if not size > NEGLIGIBLE:
-        return model, fit
+        return Settled(model, fit, error)
     again = fit_direct(key, predictor(finer), shots, model.margins.size, start=fit, step=model.step, say=say)
     gain = float((np.log(np.asarray(fit.sigma) / np.asarray(again.sigma))).mean())
     h = model.system.dt / model.system.substeps
     if gain <= 0.01:
-        return model, fit
+        return Settled(model, fit, error)
     remark = f"time step {h / REFINED:g} s instead of {h:g} s: the integration error is {size:.1f} times the noise"
     say(remark)
-    return dataclasses.replace(finer, remarks=(*finer.remarks, remark)), again
+    return Settled(dataclasses.replace(finer, remarks=(*finer.remarks, remark)), again, error / REFINED)
 
 
-_simulated = jax.jit(
-    lambda predict, inputs, z, delta: jax.vmap(predict, in_axes=(None, 0, 0))(z, delta, inputs), static_argnums=0
-)
 REFINED = 4
 NEGLIGIBLE = 0.3
 """Of the noise: an integration error that is smaller changes nothing."""
