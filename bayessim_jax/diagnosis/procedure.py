@@ -54,7 +54,7 @@ GLANCED = 4
 """Partners of a leader that are fitted to the end."""
 WORTH = 0.5
 """Share of the best effect's gain from which another is simulated."""
-LOST, MOST_LOST = 25.0, 0.15
+LOST, MOST_LOST = 25.0, 0.1
 """A window whose misfit is so many times the median one cannot be followed, as long as no more than a share are so."""
 TRIMMED = 0.05
 """Share of windows that do not count for what a candidate leaves."""

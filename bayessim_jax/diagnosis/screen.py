@@ -45,7 +45,7 @@ __all__ = ["Screen", "Screened"]
 FINE = 4
 """Most time steps in a row at which effects are evaluated."""
 ITERATIONS = 6
-BEGINNING, KEPT, LASTING = 4, 2, 10
+BEGINNING, KEPT, LASTING = 8, 2, 8
 """Steps of the solver from every point that a candidate is begun from, how many go on, and their further steps."""
 MOVED = 0.15
 """Of θ's z: how far it may move before the steps are linearized anew."""
