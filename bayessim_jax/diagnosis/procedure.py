@@ -54,10 +54,6 @@ GLANCED = 4
 """Partners of a leader that are fitted to the end."""
 WORTH = 0.5
 """Share of the best effect's gain from which another is simulated."""
-LOST, MOST_LOST = 25.0, 0.1
-"""A window whose misfit is so many times the median one cannot be followed, as long as no more than a share are so."""
-TRIMMED = 0.05
-"""Share of windows that do not count for what a candidate leaves."""
 DOUBT = 0.05
 """Probability that a model fails in a window, where the simulator without effects then predicts."""
 FOLDS = 4
@@ -141,13 +137,6 @@ class _Work:
         sigma = np.sqrt((r[kept] ** 2).sum((0, 1)) / np.maximum(counts * share, 1))
         return jnp.maximum(jnp.asarray(sigma), self.floor)
 
-    def followed(self, r: np.ndarray, sigma: Array, which: np.ndarray) -> np.ndarray:
-        """Those of some windows that a fit can follow: stick-slip and falling over are chaotic, and a few are lost."""
-        counts = np.maximum(np.asarray(self.bench.shots.measured).sum((1, 2)), 1)
-        size = np.nan_to_num(((r / np.asarray(sigma)) ** 2).sum((1, 2)) / counts, nan=np.inf)
-        lost = which & (size > LOST * np.median(size[which]))
-        return which & ~lost if lost.sum() <= MOST_LOST * which.sum() else which
-
     def settle(
         self, candidate: Candidate, fit: Fit, which: Bool[np.ndarray, " windows"], rounds: int = 4, steps: int = 12
     ) -> Fit:
@@ -155,10 +144,9 @@ class _Work:
         free = self.bench.d + len(self.bench.columns(candidate))
         for _ in range(rounds):
             r = np.asarray(self.bench.look(candidate, fit, self.mask())[0])
-            kept = self.followed(r, fit.sigma, which) if candidate.effects else which
-            sigma = self.noise(r, kept, free)
+            sigma = self.noise(r, which, free)
             change = float(jnp.abs(jnp.log(sigma / fit.sigma)).max())
-            fit = self.bench.fit(candidate, fit.z, fit.delta, sigma, self.mask(kept), steps=steps)
+            fit = self.bench.fit(candidate, fit.z, fit.delta, sigma, self.mask(which), steps=steps)
             if change < 0.03:
                 break
         return fit
@@ -377,15 +365,10 @@ def _enter(
 
 
 def share_left(after: Misfit, before: Misfit) -> float:
-    """Share of a misfit that a candidate leaves, both in units of the smaller noise.
-
-    The few windows that it leaves most in are left out of both: where motion is chaotic nothing is explained.
-    """
+    """Share of a misfit that a candidate leaves, both in units of the smaller noise."""
     noise = np.minimum(after.noise, before.noise)
-    own = (after.excess * (after.noise / noise) ** 2).sum(1)
-    was = (before.excess * (before.noise / noise) ** 2).sum(1)
-    kept = np.argsort(own)[: max(len(own) - int(TRIMMED * len(own)), 1)]
-    return float(max(own[kept].sum(), 0.0) / max(was[kept].sum(), 1e-12))
+    own, was = ((m.excess * (m.noise / noise) ** 2).sum() for m in (after, before))
+    return float(max(own, 0.0) / max(was, 1e-12))
 
 
 def _decide(
