@@ -9,7 +9,7 @@ from pathlib import Path
 from benchmarks.timing import CLOCKS, choose_clock
 
 _MECHANISMS = ("pendulum", "cart-pole", "double pendulum", "3-joint arm", "6-joint arm")
-_RIGS = ("pendulum", "slide", "double", "cart", "arm3", "arm6")
+_RIGS = ("pendulum", "swing", "slide", "sled", "double", "cart", "arm3", "arm6")
 
 
 def main() -> None:
@@ -48,7 +48,9 @@ def main() -> None:
     engines.add_argument("--mjx", type=int, default=1024, metavar="BATCH", help="batch of MJX; 0 leaves it out")
 
     concealed = commands.add_parser("concealed", help="diagnoses of machines with effects concealed in them")
-    concealed.add_argument("--rigs", nargs="+", default=[*_RIGS], choices=_RIGS)
+    concealed.add_argument(
+        "--rigs", nargs="+", choices=_RIGS, help="machines; those without contacts and with motors if left out"
+    )
     concealed.add_argument("--cases", type=int, default=200)
     concealed.add_argument("--seed", type=int, default=1)
     concealed.add_argument("--out", type=Path, help="file of JSON lines to append cases to, and to resume from")

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from bayessim_jax.concealment import LAWS, UNKNOWN, StrengthError
-from benchmarks.worlds import RIGS, make_case
+from benchmarks.worlds import MODELS, RIGS, make_case
 
 if TYPE_CHECKING:
     from argparse import Namespace
@@ -144,7 +144,7 @@ def diagnose_concealed(options: Namespace) -> None:
     from bayessim_jax.recordings.shots import case_model
 
     jax.config.update("jax_enable_x64", True)
-    cases = draw_cases(options.rigs, options.cases, options.seed)
+    cases = draw_cases(options.rigs or list(MODELS), options.cases, options.seed)
     done: dict[int, dict[str, Any]] = {}
     if options.out is not None and options.out.exists():
         rows = [json.loads(line) for line in options.out.read_text(encoding="utf-8").splitlines()]

@@ -10,7 +10,7 @@ from typing import Any
 from bayessim_jax.recordings.concealing import conceal
 from benchmarks.mechanisms import SMOOTH_MODELS
 
-__all__ = ["RIGS", "Rig", "make_case"]
+__all__ = ["MODELS", "RIGS", "Rig", "make_case"]
 
 
 @dataclass(frozen=True)
@@ -75,9 +75,23 @@ RIGS = {
         ),
         ("body/cart/mass", "body/pole/mass"),
     ),
+    "sled": Rig(
+        _rig(
+            '<geom name="floor" type="plane" size="5 5 1" friction="0.4"/>'
+            '<body name="sled" pos="0 0 0.1"><joint name="rail" type="slide" axis="1 0 0"/>'
+            '<joint name="lift" type="slide" axis="0 0 1"/>'
+            '<geom name="runner" type="box" size="0.2 0.1 0.1" mass="2" friction="0.4"/></body>',
+            '<motor name="motor" joint="rail"/>',
+        ),
+        ("body/sled/mass",),
+    ),
     "arm3": Rig(SMOOTH_MODELS["3-joint arm"].xml, ("body/shoulder/mass", "body/elbow/mass")),
     "arm6": Rig(SMOOTH_MODELS["6-joint arm"].xml, ("body/shoulder/mass", "body/elbow/mass", "body/wrist_1/mass")),
 }
+
+
+MODELS = ("pendulum", "slide", "double", "cart", "arm3", "arm6")
+"""Those that are diagnosed unless others are asked for: one to six joints, without contacts."""
 
 
 def make_case(folder: Path, rig: str, effect: str | list[str] | None = None, **settings: Any) -> dict[str, Any]:

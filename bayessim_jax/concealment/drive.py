@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from bayessim_jax.concealment.motions import Motion, draw_motions
-from bayessim_jax.concealment.places import driven_joint
+from bayessim_jax.concealment.places import driven_joint, dry_geoms
 from bayessim_jax.concealment.world import FINE, RunawayError, build, simulate
 
 __all__ = ["Drive", "find_drive"]
@@ -107,9 +107,10 @@ def _guess(model: mujoco.MjModel) -> Drive:
     """Home, gains, and amplitudes to begin with."""
     home, swing, scatter = np.array(model.qpos0), np.zeros(model.nv), np.zeros(model.nq)
     driven = {driven_joint(model, i) for i in range(model.nu)}
+    touches = bool(dry_geoms(model))
     for j in range(model.njnt):
         q, v, kind = model.jnt_qposadr[j], model.jnt_dofadr[j], mujoco.mjtJoint(model.jnt_type[j])
-        if kind not in SWING:
+        if kind not in SWING or (touches and j not in driven):  # what stands on the ground stays there
             continue
         swing[v] = SWING[kind]
         scatter[q] = WIDE if j not in driven and kind == mujoco.mjtJoint.mjJNT_HINGE else swing[v]

@@ -98,7 +98,7 @@ class TorqueRipple(ForceLaw):
 class Hysteresis(ForceLaw):
     """τ = −κ z, ż = v [A − (β sign(v z) + γ) |z|ⁿ] with A = 1, integrated by Heun's rule.
 
-    Source: Bouc 1967; Wen 1976
+    Source: Wen 1976
     """
 
     name = "hysteresis"

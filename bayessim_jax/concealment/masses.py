@@ -75,6 +75,7 @@ class Payload(ModelLaw):
         mujoco.mju_mat2Quat(quaternion, axes.ravel())
         model.body_mass[body] = mass + self.mass
         model.body_ipos[body], model.body_inertia[body], model.body_iquat[body] = new, moments, quaternion
+        model.body_sameframe[body] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 
 
 @dataclass
@@ -97,7 +98,10 @@ class LinkOffset(ModelLaw):
 
     def edit(self, model: mujoco.MjModel) -> None:
         """Shifted."""
+        if self.offset == 0.0:
+            return
         _, along, across = link_axes(model, self.spot.body)
+        model.body_sameframe[self.spot.body] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
         model.body_ipos[self.spot.body] += self.offset * (across if self.spot.detail else along)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -85,8 +84,9 @@ class Scene:
     def strength(self, spot: Spot, tracks: Sequence[Track]) -> float:
         """Root mean square of what the model lacks at a spot's joint over that of what motors and gravity exert there.
 
-        What it lacks is the force that the motion as the encoders show it takes, by inverse dynamics, less what the
-        motors exert in the model under the recorded commands. Where a spot has no joint, at that where it is most.
+        What it lacks is the force that would take the model, under the recorded commands, from one row of the motion to
+        the next as the encoders show it, on average over that time. Of a spot without a joint, it is that of the joint
+        where it is most.
         """
         missing, applied, _ = _forces(self.model, tracks)
         rms = [np.sqrt(np.mean(x**2, axis=0)) for x in (missing, applied)]
@@ -133,45 +133,43 @@ def make_scene(
 
 
 def _forces(model: mujoco.MjModel, tracks: Sequence[Track]) -> tuple[Forces, Forces, Forces]:
-    """What the model lacks, what motors and gravity exert together, and the motors alone, at rows of the recordings."""
-    inverse = copy.copy(model)
-    inverse.opt.timestep = model.opt.timestep / FINE
-    if model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
-        inverse.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_INVDISCRETE
-    data = mujoco.MjData(inverse)
+    """What the model lacks, what motors and gravity exert together, and the motors alone, from row to row.
+
+    The first is M (v' − v̂')/Δt with v' the velocity at the next row and v̂' what the model makes of this one.
+    """
+    plain = build(model, ())
+    data, mass = mujoco.MjData(plain), np.zeros((model.nv, model.nv))
     every = max(1, sum(len(track.rows) for track in tracks) // SAMPLES)
     missing, applied, motors = [], [], []
     for track in tracks:
-        qvel, qacc = _derivatives(model, track)
+        qvel, h = _velocities(model, track), float(track.time[1] - track.time[0])
         for row in range(0, len(track.rows) - 1, every):
-            k = track.rows[row]
-            data.qpos[:], data.qvel[:], data.ctrl[:] = track.shown[k], 0.0, track.ctrl[row]
-            mujoco.mj_fwdPosition(inverse, data)
-            mujoco.mj_fwdVelocity(inverse, data)
+            first, last = int(track.rows[row]), int(track.rows[row + 1])
+            data.qpos[:], data.qvel[:], data.ctrl[:] = track.shown[first], 0.0, track.ctrl[row]
+            mujoco.mj_fwdPosition(plain, data)
+            mujoco.mj_fwdVelocity(plain, data)
             weight = data.qfrc_bias.copy()
-            data.qvel[:], data.qacc[:] = qvel[k], qacc[k]
-            mujoco.mj_inverse(inverse, data)
-            needed = data.qfrc_inverse.copy()
-            _settle(inverse, data)
-            mujoco.mj_fwdActuation(inverse, data)
+            data.qvel[:], data.qacc_warmstart[:] = qvel[first], 0.0
+            mujoco.mj_fwdVelocity(plain, data)
+            _settle(plain, data)
+            mujoco.mj_fwdActuation(plain, data)
             motors.append(data.qfrc_actuator.copy())
             applied.append(motors[-1] - weight)
-            missing.append(needed - motors[-1])
+            mujoco.mj_fullM(plain, data, mass)
+            mujoco.mj_step(plain, data, last - first)
+            missing.append(mass @ (qvel[last] - data.qvel) / ((last - first) * h))
     return np.array(missing), np.array(applied), np.array(motors)
 
 
-def _derivatives(model: mujoco.MjModel, track: Track) -> tuple[np.ndarray, np.ndarray]:
-    """Velocities and accelerations of the motion as it is shown."""
-    h = float(track.time[1] - track.time[0])
-    qvel, qacc = track.qvel.copy(), np.diff(track.qvel, axis=0, append=track.qvel[-1:]) / h
+def _velocities(model: mujoco.MjModel, track: Track) -> np.ndarray:
+    """Velocities of the motion as it is shown."""
+    h, qvel = float(track.time[1] - track.time[0]), track.qvel.copy()
     for j in range(model.njnt):
         q, v = model.jnt_qposadr[j], model.jnt_dofadr[j]
         error = track.shown[:, q] - track.qpos[:, q]
         if error.any():
-            rate = np.gradient(error, h)
-            qvel[:, v] += rate
-            qacc[:, v] += np.gradient(rate, h)
-    return qvel, qacc
+            qvel[:, v] += np.gradient(error, h)
+    return qvel
 
 
 def _settle(model: mujoco.MjModel, data: mujoco.MjData) -> None:

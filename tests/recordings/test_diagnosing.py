@@ -20,7 +20,8 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def friction(folder):
-    sealed = make_case(folder / "friction", "pendulum", "coulomb_friction", seed=11, recordings=4, seconds=3.0)
+    settings = {"seed": 11, "recordings": 4, "seconds": 3.0, "motions": "sines"}
+    sealed = make_case(folder / "friction", "pendulum", "coulomb_friction", **settings)
     assert main(["diagnose", str(folder / "friction"), "--out", str(folder / "friction-run"), "--quiet"]) == 0
     assert not jax.config.read("jax_enable_x64")
     table = json.loads((folder / "friction-run" / "diagnosis.json").read_text())
@@ -67,8 +68,8 @@ def test_recordings_given_later_are_scored(friction, folder, capsys):
     assert main(["evaluate", str(run), "--recordings", str(folder / "friction" / "recordings" / held)]) == 0
     found = json.loads((run / "evaluation.json").read_text())["fit"]
     assert found["held_out"] == [held]
-    assert found["baseline"]["nrmse"] == pytest.approx(table["fit"]["baseline"]["nrmse"], rel=0.2)
-    assert found["augmented"]["nrmse"] == pytest.approx(table["fit"]["augmented"]["nrmse"], rel=0.3)
+    ratios = [fit["augmented"]["nrmse"] / fit["baseline"]["nrmse"] for fit in (found, table["fit"])]
+    assert ratios[0] == pytest.approx(ratios[1], rel=0.3)  # each over how far its own recordings go
     assert "augmented" in capsys.readouterr().out
     assert main(["evaluate", str(run), "--recordings", str(folder / "nothing" / "*.csv")]) == 2
     assert main(["evaluate", str(folder), "--recordings", "x.csv"]) == 2
