@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -108,6 +109,18 @@ class Truncated:
     def covariance(self) -> Float[Array, "d d"]:
         """Cov θ of the truncated law."""
         return self.scatter
+
+    def loosen(self, share: float | Scalar) -> Truncated:
+        """(1 − share) p + share U(θ; box): θ may have been drawn anew from the prior, with that probability."""
+        flat = Truncated.uniform(self.box, self.log_shares.size)
+        gap = flat.center - self.center
+        between = share * (1 - share) * jnp.outer(gap, gap)
+        return replace(
+            self,
+            prior_share=self.prior_share + share * (1 - self.prior_share),
+            center=self.center + share * gap,
+            scatter=(1 - share) * self.scatter + share * flat.scatter + between,
+        )
 
     def components(self) -> GaussianMixture:
         """A Gaussian for each component, with the mass, mean and covariance of its part in the box.

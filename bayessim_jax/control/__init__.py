@@ -38,6 +38,7 @@ __all__ = [
     "WorstCase",
     "coloured_noise",
     "default_planner",
+    "default_settings",
     "sigma_points",
     "spline_noise",
     "white_noise",
@@ -66,8 +67,12 @@ than three seconds sees only that this costs more than to stand still.
 """
 
 
-def default_planner(name: str, system_name: str, system: Restartable[Any], task: Task[Any], **settings: Any) -> Planner:
-    """The planner of a registered system, or `ValueError` with the near miss."""
+def default_settings(name: str, system_name: str) -> dict[str, Any]:
+    """The settings of a planner for a registered system, or `ValueError` with the near miss."""
     use = find_named(name, PLANNERS, "unknown planner")
-    chosen = find_named(system_name, DEFAULTS, "no planner is registered for the system")
-    return Planner.create(system, task, **{**use, **chosen, **settings})
+    return {**use, **find_named(system_name, DEFAULTS, "no planner is registered for the system")}
+
+
+def default_planner(name: str, system_name: str, system: Restartable[Any], task: Task[Any], **settings: Any) -> Planner:
+    """The planner of a registered system with other settings, or `ValueError` with the near miss."""
+    return Planner.create(system, task, **{**default_settings(name, system_name), **settings})

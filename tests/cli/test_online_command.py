@@ -102,7 +102,7 @@ def test_bad_config(capsys, tmp_path, text, message):
 
 
 def test_a_system_that_gymnasium_does_not_have(capsys, tmp_path):
-    told = refused(capsys, "skid_steer", "--out", tmp_path / "run")
+    told = refused(capsys, "skid_steer", "--target", "gymnasium", "--out", tmp_path / "run")
     assert told == "bayessim: Gymnasium has no environment for skid_steer; add --target simulated.\n"
     assert not (tmp_path / "run").exists()
 
@@ -159,15 +159,15 @@ def test_a_plan_is_complete_and_repeats():
     assert plan.settings.schedule["epochs"] > 0
     assert plan.settings.learner["envs"] > 0
     assert plan.seeds == [5, 6]
-    lengths, masses = plan.truths.T
+    lengths, masses = plan.truths.first.T
     assert masses == pytest.approx([0.3, 0.3])
     assert lengths[0] != lengths[1]
     assert ((lengths >= 0.2) & (lengths <= 0.8)).all()
     again = make_plan(plan.settings)
     assert again.settings == plan.settings
-    np.testing.assert_array_equal(again.truths, plan.truths)
+    np.testing.assert_array_equal(again.truths.first, plan.truths.first)
     alone = make_plan(Settings("cartpole", seed=6, truth={"mass": 0.3}, prior={"length": (0.2, 0.8)}))
-    np.testing.assert_array_equal(alone.truths[0], plan.truths[1])
+    np.testing.assert_array_equal(alone.truths.first[0], plan.truths.first[1])
 
 
 def lines(path):
@@ -227,7 +227,7 @@ def test_the_command_does_what_the_library_does(tmp_path):
     told = lines(tmp_path / "run")
     np.testing.assert_allclose([line["log_q_validation"] for line in told], infos.fit.log_q_validation, rtol=1e-3)
     np.testing.assert_array_equal([line["return_target"] for line in told], infos.return_target)
-    exact = jax.vmap(lambda belief: belief.log_prob(jnp.asarray(plan.truths[0])))(infos.belief)
+    exact = jax.vmap(lambda belief: belief.log_prob(jnp.asarray(plan.truths.first[0])))(infos.belief)
     np.testing.assert_allclose([line["log_prob_true"] for line in told], exact, atol=1e-3)
 
 
