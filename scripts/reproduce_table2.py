@@ -24,7 +24,7 @@ from trials import resume
 
 from bayessim_jax import online
 from bayessim_jax.beliefs import GaussianMixture
-from bayessim_jax.control import default_planner
+from bayessim_jax.control import USES, default_planner
 from bayessim_jax.effects.vehicle import OnVehicle, SkidSteerVehicle
 from bayessim_jax.engines.simulated import SimulatedTarget
 from bayessim_jax.systems import FollowCircle, SkidSteer
@@ -41,12 +41,13 @@ def main() -> None:
     """Run what is asked for and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=20)
-    parser.add_argument("--steps", type=int, default=100, help="control periods of a recording")
+    parser.add_argument("--steps", type=int, default=200, help="control periods of a recording")
     parser.add_argument("--episode", type=int, default=500, help="control periods of an episode that is judged")
     parser.add_argument("--simulations", type=int, default=400)
     parser.add_argument("--calibrations", type=int, default=64)
-    parser.add_argument("--samples", type=int, default=128, help="plans in a control step, each under every particle")
-    parser.add_argument("--particles", type=int, default=8)
+    parser.add_argument("--use", choices=USES, default="mean", help="how θ enters the plans")
+    parser.add_argument("--samples", type=int, default=512, help="plans in a control step")
+    parser.add_argument("--particles", type=int, default=8, help="draws of θ for each plan, where particles are used")
     parser.add_argument("--target", choices=("vehicle", "simulated"), default="vehicle")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="file of JSON lines to append runs to, and to resume from")
@@ -73,7 +74,7 @@ def make_trial(args: argparse.Namespace) -> Callable[[int], dict[str, Any]]:
     """What one run gives, as a function of its number."""
     system, task = SkidSteer.create(**WIDE), FollowCircle(steps=args.episode)
     truth = jnp.asarray(TRUTH)
-    planner = default_planner("disco", "skid_steer", system, task, samples=args.samples, particles=args.particles)
+    planner = default_planner("disco", "skid_steer", system, task, **_planning(args))
     setup = online.Setup.create(
         system,
         planner,
@@ -114,6 +115,10 @@ def make_trial(args: argparse.Namespace) -> Callable[[int], dict[str, Any]]:
         )
 
     return make
+
+
+def _planning(args: argparse.Namespace) -> dict[str, Any]:
+    return {"use": args.use, "samples": args.samples, "particles": args.particles}
 
 
 def _spread(values: np.ndarray) -> str:

@@ -52,7 +52,7 @@ class Disco:
         cls,
         system: Restartable[Any],
         task: Task[Any],
-        use: str = "particles",
+        use: str = "mean",
         *,
         risk: str | Risk = "mean",
         particles: int = 16,

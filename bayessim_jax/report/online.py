@@ -64,14 +64,13 @@ def _control(run: OnlineRun) -> list[str]:
         )
     caption = f"Mean cost of a step so far, while rounds {rounds} were recorded{which}."
     figures.append(html.figure(cost_plot(drives), "Mean cost of a step so far, over time.", caption))
-    parts = [html.figures(*figures)]
     if scene is not None:
         caption = (
             f"Round {run.rounds}: a few of the plans that are weighed at each moment, their weighted mean, and the way "
             "taken. They were planned again along the recorded poses, and are drawn under the mean of the belief."
         )
-        parts.append(html.figures(drive_animation(scene, caption)))
-    return parts
+        figures.append(drive_animation(scene, caption))
+    return [html.figures(*figures)]
 
 
 def _posterior(run: OnlineRun) -> list[str]:

@@ -49,7 +49,7 @@ SYSTEMS: dict[str, Entry] = {
     ),
     "acrobot": Entry(Acrobot.create, Raise, "ppo", "swing two links up with a motor at the elbow only"),
     "skid_steer": Entry(
-        SkidSteer.create, FollowCircle, "disco", "drive around a circle on wheels that slide sideways", FollowCircle
+        SkidSteer.create, FollowCircle, "mppi", "drive around a circle on wheels that slide sideways", FollowCircle
     ),
 }
 

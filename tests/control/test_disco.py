@@ -171,7 +171,7 @@ def test_a_new_belief_is_planned_with_and_recompiles_nothing(use):
 
 
 def test_jitter_disturbs_recorded_actions_and_not_judged_ones():
-    planner = Planner.create(Pendulum.create(), Upswing(), samples=16, jitter=0.3)
+    planner = Planner.create(Pendulum.create(), Upswing(), use="particles", samples=16, jitter=0.3)
     state, look, key = planner.init(jax.random.key(0)), jnp.array([1.0, 0.0, 0.0]), jax.random.key(1)
     judged, recorded = (p.act(key, p.init(), look) for p in (planner.policy(state, True), planner.policy(state)))
     assert not jnp.array_equal(judged[0], recorded[0])
