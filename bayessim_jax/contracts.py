@@ -21,6 +21,7 @@ __all__ = [
     "Learner",
     "Policy",
     "Recording",
+    "Restartable",
     "Scalar",
     "System",
     "Target",
@@ -128,6 +129,15 @@ class System(Protocol[S]):
 
     def observe(self, theta: Float[Array, " d"], state: S) -> Float[Array, " obs"]:
         """What the sensors show of a state, before noise."""
+        ...
+
+
+@runtime_checkable
+class Restartable(System[S], Protocol[S]):
+    """A system that can start from what its sensors show: what a planner, or a replay of a recording, begins with."""
+
+    def restart(self, theta: Float[Array, " d"], observation: Float[Array, " obs"]) -> S:
+        """A state that shows this observation; what the sensors do not see of it is at rest."""
         ...
 
 

@@ -27,6 +27,7 @@ from bayessim_jax.beliefs import Truncated
 from bayessim_jax.contracts import Estimator, Learner, Policy, Recording, Scalar, System, Target, Task
 from bayessim_jax.inference.estimators import recurrent_mixture
 from bayessim_jax.inference.proposals import ProposalMode, lookup_proposal, pool_weights
+from bayessim_jax.learning.fixed import RecordedActions
 from bayessim_jax.rollout import rollout
 
 __all__ = [
@@ -75,6 +76,13 @@ class Setup:
     """Draws of θ for which as many recordings are simulated as the target has given, to calibrate their posterior."""
     components: int = struct.field(pytree_node=False, default=5)
     """Gaussians in the belief."""
+    replay: bool = struct.field(pytree_node=False, default=False)
+    """Simulate under the recorded actions in place of the policy that chose them. The policy's share in the likelihood
+    of a recording does not depend on θ, so the posterior is the same; planners are too dear to be simulated with."""
+
+    forget: float = struct.field(pytree_node=False, default=0.0)
+    """Probability that θ of the target changed between two rounds. Above 0, simulations are made for what the prior
+    allows too, and recordings that contradict the newest one no longer count."""
 
     @classmethod
     def create(
@@ -85,12 +93,16 @@ class Setup:
         *,
         estimator: Estimator[Any] | None = None,
         proposal: str | ProposalMode = "corrected",
+        replay: bool = False,
+        forget: float = 0.0,
         **sizes: int,
     ) -> Setup:
         """The paper's settings, unless told otherwise; the prior is uniform on `system.parameters`."""
         for name, value in sizes.items():
             if value < (0 if name == "evaluations" else 1):
                 raise ValueError(f"Setup: {name} is {value}; it must be a positive number.")
+        if not 0 <= forget < 1:
+            raise ValueError(f"Setup: forget is {forget}; it is a probability, from 0 to below 1.")
         if sizes.get("history", cls.history) % sizes.get("recordings", cls.recordings):
             raise ValueError("Setup: history must be a multiple of recordings, so that a round's set stays together.")
         return cls(
@@ -99,6 +111,8 @@ class Setup:
             task=task,
             estimator=recurrent_mixture() if estimator is None else estimator,
             proposal=lookup_proposal(proposal) if isinstance(proposal, str) else proposal,
+            replay=replay,
+            forget=forget,
             **sizes,
         )
 
@@ -125,7 +139,7 @@ class State:
     history: Recording
     """What the target has shown, leading axis `setup.history`; the slots not yet filled are empty recordings."""
     policies: Any
-    """The policy under which each recording of `history` was made."""
+    """The policy under which each recording of `history` was made, or its actions where they are replayed."""
 
 
 @struct.dataclass
@@ -144,6 +158,8 @@ class RoundInfo:
     """The learner's Info: at least `return_mean` and `nonfinite`."""
     return_target: Scalar
     """Mean return of the evaluation episodes on the target; NaN where none is run."""
+    cost_target: Scalar
+    """Minus the mean reward of a step in them."""
     diverged: Int[Array, ""]
     """Simulations of this round that were masked because a number was not finite."""
     pool_size: Scalar
@@ -173,9 +189,10 @@ def init(key: PRNGKeyArray, setup: Setup) -> State:
     learner_key, estimator_key = jax.random.split(key)
     belief = Truncated.uniform(setup.system.parameters, setup.components)
     learner = setup.learner.init(learner_key)
-    proposal = setup.proposal.propose(belief)
+    proposal = setup.proposal.propose(belief.loosen(setup.forget) if setup.forget else belief)
     d = setup.system.parameters.size
-    policy = setup.learner.policy(learner)
+    idle = RecordedActions(jnp.zeros((setup.steps, setup.system.actions.size)))
+    policy = idle if setup.replay else setup.learner.policy(learner)
     one = jax.eval_shape(lambda: simulate(key, setup, policy, belief.box.low[None]))
     remembered = setup.history if setup.proposal.accumulate else setup.recordings
     slots = setup.pool if setup.proposal.reuse else 1
@@ -219,13 +236,15 @@ def record(key: PRNGKeyArray, setup: Setup, target: Target, state: State) -> Rec
     return jax.vmap(lambda k: target.record(k, policy, setup.steps))(keys)
 
 
-def evaluate(key: PRNGKeyArray, setup: Setup, target: Target, state: State) -> Scalar:
-    """Mean return of the deterministic policy over `setup.evaluations` full episodes on the target."""
+def evaluate(key: PRNGKeyArray, setup: Setup, target: Target, state: State) -> tuple[Scalar, Scalar]:
+    """Mean return, and mean cost of a step, of the deterministic policy in `setup.evaluations` full episodes."""
     if setup.task is None or setup.evaluations == 0:
-        return jnp.array(jnp.nan)
+        return jnp.array(jnp.nan), jnp.array(jnp.nan)
     policy, steps = setup.learner.policy(state.learner, deterministic=True), setup.task.steps
     keys = jax.random.split(jax.random.fold_in(key, state.round), setup.evaluations)
-    return jax.vmap(lambda k: target.record(k, policy, steps).rewards.sum())(keys).mean()
+    seen = jax.vmap(lambda k: target.record(k, policy, steps))(keys)
+    returns = seen.rewards.sum(-1)
+    return returns.mean(), -(returns / jnp.maximum(seen.valid.sum(-1), 1)).mean()
 
 
 def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording) -> tuple[State, RoundInfo]:
@@ -241,11 +260,12 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
     draw_key, simulate_key, fit_key, calibrate_key, learn_key = jax.random.split(
         jax.random.fold_in(key, state.round), 5
     )
-    policy = setup.learner.policy(state.learner)
+    policy = RecordedActions(recordings.actions) if setup.replay else setup.learner.policy(state.learner)
     history, policies, use, newest = _remember(state, recordings, policy)
 
     # simulate around the belief, every other draw under an earlier policy whose recordings still count
-    proposal = setup.proposal.propose(state.belief)
+    known = state.belief.loosen(setup.forget) if setup.forget else state.belief
+    proposal = setup.proposal.propose(known)
     fresh = setup.simulations
     thetas = jax.vmap(proposal.sample)(jax.random.split(draw_key, fresh + setup.calibrations))
     slot_key, simulate_key = jax.random.split(simulate_key)
@@ -256,6 +276,9 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
     weights = pool_weights(pool.thetas, pool.proposals, pool.filled, proposal).ravel()
     points, singles = jax.tree.map(_rows, (pool.thetas, pool.recordings))
     estimator, fit = setup.estimator.fit(fit_key, state.estimator, points, singles, weights)
+
+    if setup.forget:
+        use = use & _agree(setup, estimator, history, newest)
 
     # the posterior of everything the target has shown, calibrated on sets made under the same policies
     set_keys = jax.random.split(jax.random.fold_in(calibrate_key, 0), use.size)
@@ -279,6 +302,7 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
         calibration=calibration,
         learning=learning,
         return_target=jnp.array(jnp.nan),
+        cost_target=jnp.array(jnp.nan),
         diverged=simulated.diverged.sum(),
         pool_size=weights.sum() ** 2 / (weights**2).sum(),
         uninformed=uninformed,
@@ -297,7 +321,8 @@ def run(
     def one_round(state: State, _: None) -> tuple[State, RoundInfo]:
         recordings = record(keys.record, setup, target, state)
         state, info = update(keys.update, setup, state, recordings)
-        return state, replace(info, return_target=evaluate(keys.evaluate, setup, target, state))
+        returned, cost = evaluate(keys.evaluate, setup, target, state)
+        return state, replace(info, return_target=returned, cost_target=cost)
 
     return jax.lax.scan(one_round, init(keys.init, setup) if state is None else state, None, length=rounds)
 
@@ -318,6 +343,22 @@ def _remember(state: State, recordings: Recording, policy: Policy) -> tuple[Reco
     policies = jax.tree.map(lambda leaf, part: leaf.at[rows].set(part), state.policies, policy)
     use = (jnp.arange(size) < (state.round + 1) * new) & ~history.diverged
     return history, policies, use, rows[-1]
+
+
+def _agree(setup: Setup, estimator: Any, history: Recording, newest: Array) -> Bool[Array, " set"]:
+    """Which recordings could be of the same θ as the newest: the means of their own posteriors are not too far apart.
+
+    The squared distance over the sum of both covariances is then χ² with d degrees of freedom; it is too large in one
+    of a thousand.
+    """
+    alone = lambda one: setup.estimator.posterior(  # noqa: E731
+        estimator, jax.tree.map(lambda leaf: leaf[None], one), jnp.ones(1, bool)
+    )
+    each = jax.vmap(alone)(history)
+    means, covariances = jax.vmap(lambda q: (q.mean(), q.covariance()))(each)
+    gaps, widths = means - means[newest], covariances + covariances[newest]
+    distance = jax.vmap(lambda gap, width: gap @ jnp.linalg.solve(width, gap))(gaps, widths)
+    return jax.scipy.stats.chi2.sf(distance, means.shape[-1]) > 1e-3
 
 
 def _rows(leaf: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Benchmarks: `python -m benchmarks online | estimator | scaling | engines | concealed`."""
+"""Benchmarks: `python -m benchmarks online | estimator | scaling | engines | concealed | mppi`."""
 
 from __future__ import annotations
 
@@ -55,7 +55,11 @@ def main() -> None:
     concealed.add_argument("--seed", type=int, default=1)
     concealed.add_argument("--out", type=Path, help="file of JSON lines to append cases to, and to resume from")
 
-    for command in (online, estimator, scaling, engines):
+    mppi = commands.add_parser("mppi", help="a control step of DISCO on the pendulum against pytorch_mppi")
+    mppi.add_argument("--repeats", type=int, default=7)
+    _add_common(mppi)
+
+    for command in (online, estimator, scaling, engines, mppi):
         command.add_argument("--clock", choices=CLOCKS, default="wall", help="cpu: seconds summed over threads")
 
     options = parser.parse_args()
@@ -73,6 +77,10 @@ def main() -> None:
         from benchmarks.estimator import compare_estimators
 
         compare_estimators(options)
+    elif options.command == "mppi":
+        from benchmarks.mppi import compare_planners
+
+        compare_planners(options)
     elif options.command == "engines":
         _use_all_cores()
         from benchmarks.engines import compare_engines

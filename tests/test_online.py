@@ -8,12 +8,14 @@ from flax import struct
 from bayessim_jax import online
 from bayessim_jax.beliefs import GaussianMixture, Truncated
 from bayessim_jax.contracts import Box
+from bayessim_jax.control import default_planner
 from bayessim_jax.engines.simulated import SimulatedTarget
 from bayessim_jax.inference import Lstm, MixtureHead, Schedule, recurrent_mixture
 from bayessim_jax.inference.estimators import MixtureDensity
 from bayessim_jax.inference.proposals import Corrected
-from bayessim_jax.learning import Fixed, Ppo, RandomPolicy, default_learner
-from bayessim_jax.systems import Balance, CartPole, from_functions
+from bayessim_jax.learning import Fixed, Ppo, RandomPolicy, RecordedActions, default_learner
+from bayessim_jax.rollout import rollout
+from bayessim_jax.systems import Balance, CartPole, Pendulum, Upswing, from_functions
 
 TINY = MixtureDensity(Lstm(8, frame=4), MixtureHead(2, 8), Schedule(epochs=10, draws=32, batch=16), members=1, folds=4)
 
@@ -202,3 +204,59 @@ def test_a_wider_posterior_that_agrees_leaves_the_belief_and_one_that_disagrees_
         after, info = update(jax.random.key(2), given, state, recordings)
         assert bool(info.uninformed) == stays
         assert _same(after.belief, known if stays else given.proposal.answer)
+
+
+def test_recordings_that_are_replayed_are_those_of_the_truth():
+    """Under recorded actions and the same start, the simulator at θ* shows what was recorded."""
+    system, truth = CartPole.create(noise=0.0), jnp.array([0.4, 0.6])
+    seen = rollout(jax.random.key(1), system, truth, RandomPolicy(system.actions), 16)
+    again = rollout(jax.random.key(1), system, truth, RecordedActions(seen.actions), 16)
+    assert _same(seen, again)
+    other = rollout(jax.random.key(1), system, jnp.array([0.9, 0.2]), RecordedActions(seen.actions), 16)
+    assert jnp.array_equal(other.actions, seen.actions)
+    assert not jnp.allclose(other.observations, seen.observations)
+
+
+def test_a_planner_in_the_loop_is_simulated_with_its_actions_and_forgets():
+    system, task = Pendulum.create(), Upswing(steps=30)
+    planner = default_planner("disco", "pendulum", system, task, horizon=5, samples=8, particles=2)
+    sizes = {"steps": 16, "simulations": 32, "pool": 2, "components": 2, "history": 4, "calibrations": 16}
+    setup = online.Setup.create(system, planner, task, estimator=TINY, replay=True, forget=0.2, **sizes)
+    target = SimulatedTarget(system, task, jnp.array([0.4, 0.6]))
+    state, infos = jax.jit(online.run, static_argnames="rounds")(jax.random.key(0), setup, target, rounds=3)
+    recorded = infos.recordings.actions[:, 0]
+    assert jnp.array_equal(state.policies.actions[:3], recorded)
+    simulated = state.pool.recordings.actions[2 % 2]
+    matches = (simulated[:, 0, None] == recorded[None]).all((2, 3))
+    assert matches.any(1).all()
+    assert jnp.isfinite(infos.cost_target).all()
+    assert jnp.allclose(infos.cost_target, -infos.return_target / 30, rtol=1e-5)
+
+
+def test_a_contradicting_recording_no_longer_counts():
+    class Reads:
+        """The posterior of one recording is around its first observation."""
+
+        def posterior(self, state, recordings, use):
+            return GaussianMixture(jnp.zeros(1), recordings.observations[0, :1], 0.1 * jnp.eye(2)[None])
+
+    means = jnp.array([[0.2, 0.2], [0.8, 0.2], [0.25, 0.3], [0.3, 0.2]])
+    history = jax.tree.map(jnp.asarray, rollout(jax.random.key(0), Pendulum.create(), means[0], _still(), 1))
+    history = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (4, *leaf.shape)), history)
+    history = history.replace(observations=jnp.broadcast_to(means[:, None], (4, 2, 2)))
+    setup = online.Setup.create(Pendulum.create(), Fixed(_still()), estimator=Reads(), forget=0.1)
+    agree = online._agree(setup, None, history, jnp.array(3))
+    assert agree.tolist() == [True, False, True, True]
+
+
+def _still():
+    return RandomPolicy(Pendulum.create().actions)
+
+
+def test_a_loosened_belief_is_the_mixture_with_the_prior():
+    box = Pendulum.create().parameters
+    mixture = GaussianMixture(jnp.zeros(2), jnp.array([[0.2, 0.8], [0.4, 0.6]]), 0.05 * jnp.stack([jnp.eye(2)] * 2))
+    loose = Truncated.create(mixture, box).loosen(0.3)
+    draws = jax.vmap(loose.sample)(jax.random.split(jax.random.key(0), 20_000))
+    assert jnp.allclose(loose.mean(), draws.mean(0), atol=0.01)
+    assert jnp.allclose(loose.covariance(), jnp.cov(draws.T), atol=0.005)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -55,9 +56,7 @@ class Truncated:
     @classmethod
     def create(cls, mixture: GaussianMixture, box: Box, prior_share: float | Scalar = 0.0) -> Truncated:
         """Cut a mixture to the box. One with no representable mass in it gives the prior, told by `prior_share` = 1."""
-        u = lattice(_POINTS, box.size)
-        over = jax.vmap(jax.vmap(condition, (None, None, None, None, 0)), (0, 0, None, None, None))
-        log_each, fractions = over(mixture.means, mixture.scale_trils, box.low, box.high, u)
+        log_each, fractions = _spread(mixture, box)
         log_points = jax.nn.log_softmax(mixture.log_weights)[:, None] + log_each
         log_shares = jax.nn.logsumexp(log_points, axis=1) - jnp.log(float(_POINTS))
 
@@ -111,6 +110,36 @@ class Truncated:
         """Cov θ of the truncated law."""
         return self.scatter
 
+    def loosen(self, share: float | Scalar) -> Truncated:
+        """(1 − share) p + share U(θ; box): θ may have been drawn anew from the prior, with that probability."""
+        flat = Truncated.uniform(self.box, self.log_shares.size)
+        gap = flat.center - self.center
+        between = share * (1 - share) * jnp.outer(gap, gap)
+        return replace(
+            self,
+            prior_share=self.prior_share + share * (1 - self.prior_share),
+            center=self.center + share * gap,
+            scatter=(1 - share) * self.scatter + share * flat.scatter + between,
+        )
+
+    def components(self) -> GaussianMixture:
+        """A Gaussian for each component, with the mass, mean and covariance of its part in the box.
+
+        The prior's share is left out, unless it is everything.
+        """
+        log_each, fractions = _spread(self.mixture, self.box)
+        inside = self.box.low + fractions * self.box.width
+        weights = jax.nn.softmax(log_each, axis=1)[..., None]
+        means = (weights * inside).sum(1)
+        trils = jax.vmap(factor)(jnp.swapaxes(jnp.sqrt(weights) * (inside - means[:, None]), 1, 2))
+        flat = GaussianMixture(
+            self.log_shares,
+            jnp.broadcast_to(self.center, means.shape),
+            jnp.broadcast_to(jnp.linalg.cholesky(self.scatter), trils.shape),
+        )
+        cut = GaussianMixture(self.log_shares, means, trils)
+        return jax.tree.map(lambda a, b: jnp.where(self.prior_share >= 1.0, a, b), flat, cut)
+
     def marginal_log_prob(self, axis: int, grid: Float[Array, " n"]) -> Float[Array, " n"]:
         """Log density of one axis of θ at the points of a grid, in raw units; −∞ outside the box.
 
@@ -135,6 +164,12 @@ class Truncated:
 
     def _blend(self, flat: Scalar, cut: Float[Array, "..."]) -> Float[Array, "..."]:
         return jnp.logaddexp(_log(self.prior_share) + flat, _log(1 - self.prior_share) + cut)
+
+
+def _spread(mixture: GaussianMixture, box: Box) -> tuple[Float[Array, "components n"], Float[Array, "components n d"]]:
+    """Points of every component in the box: their log weights, and where they lie between the bounds (0 … 1)."""
+    over = jax.vmap(jax.vmap(condition, (None, None, None, None, 0)), (0, 0, None, None, None))
+    return over(mixture.means, mixture.scale_trils, box.low, box.high, lattice(_POINTS, box.size))
 
 
 def _pick(u: Scalar, log_weights: Float[Array, " n"]) -> Int[Array, ""]:

@@ -39,7 +39,7 @@ Pairs = Annotated[
     ),
 ]
 COUNTS = ("rounds", "seeds", "steps", "recordings", "pool", "history", "calibrations", "components")
-LEAST = {**dict.fromkeys(COUNTS, 1), "simulations": 10, "seed": 0, "evaluations": 0, "noise": 0.0}
+LEAST = {**dict.fromkeys(COUNTS, 1), "simulations": 10, "seed": 0, "evaluations": 0, "noise": 0.0, "forget": 0.0}
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,18 @@ class Settings:
 
     system: tyro.conf.Positional[Literal["cartpole", "pendulum", "acrobot", "skid_steer"]]
     """What to identify and control; see `bayessim systems`."""
-    target: Literal["gymnasium", "simulated"] = "gymnasium"
-    """The machine with hidden parameters: Gymnasium's environment, or this package's own system."""
+    target: Literal["auto", "gymnasium", "simulated", "vehicle"] = "auto"
+    """The machine with hidden parameters: Gymnasium's environment, this package's own system, or for skid_steer a
+    vehicle with late wheels that slip; auto is Gymnasium's where there is one, and the package's own elsewhere."""
+    controller: Literal["auto", "ppo", "sac", "mppi", "disco"] = "auto"
+    """What acts: a policy that is trained, or a planner: mppi plans under the mean of the belief, disco under the
+    belief; auto takes what suits the system."""
     truth: Pairs = field(default_factory=dict)
     """True parameters to hide in the target; those not given are drawn from the prior by the seed."""
+    change: Pairs = field(default_factory=dict)
+    """Other true parameters from a round on, such as round=10 length=0.8: what is not named stays as it was."""
+    forget: float = 0.0
+    """Probability that the true parameters change between two rounds; above 0 the belief follows a change."""
     rounds: int = 30
     """Rounds of the outer loop."""
     seed: int = 0
@@ -90,6 +98,10 @@ class Settings:
         for name, least in LEAST.items():
             if getattr(self, name) < least:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be {least} or more.")
+        if not self.forget < 1:
+            raise ValueError(f"forget is {self.forget}; it is a probability, from 0 to below 1.")
+        if self.change and not (self.change.get("round", 0) >= 2 and self.change["round"] % 1 == 0):
+            raise ValueError("change needs the round from which it holds, 2 or more, such as round=10 length=0.8.")
         if self.seed + self.seeds > 2**32:
             raise ValueError(f"seed is {self.seed}; it must be below {2**32 - self.seeds + 1}.")
         for name, (low, high) in self.prior.items():

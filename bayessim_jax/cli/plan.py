@@ -10,17 +10,19 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
-from bayessim_jax import learning, online, systems
+from bayessim_jax import control, learning, online, systems
 from bayessim_jax.cli.citations import used_sources
 from bayessim_jax.cli.options import Settings
 from bayessim_jax.cli.parsing import UsageError
 from bayessim_jax.contracts import Box
+from bayessim_jax.effects.vehicle import OnVehicle, SkidSteerVehicle
 from bayessim_jax.engines.gymnasium import GYMNASIUM, gymnasium_target
+from bayessim_jax.engines.rescored import Rescored
 from bayessim_jax.engines.simulated import SimulatedTarget
 from bayessim_jax.inference.estimators import fourier_mixture, recurrent_mixture, summary_mixture
 from bayessim_jax.inference.fit import Schedule
+from bayessim_jax.recordings.truths import Truths
 from bayessim_jax.spelling import near_miss
 
 if TYPE_CHECKING:
@@ -39,7 +41,7 @@ class Plan:
     setup: online.Setup
     target: Any
     seeds: list[int]
-    truths: Float[np.ndarray, "seed d"]
+    truths: Truths
 
     @property
     def keys(self) -> jax.Array:
@@ -59,7 +61,7 @@ class Plan:
         What calls the target on the host is apart from what only computes, because programs with callbacks are not
         kept by the persistent compilation cache.
         """
-        setup, thetas = self.setup, jax.numpy.asarray(self.truths)
+        setup, thetas = self.setup, jax.numpy.asarray(self.truths.at(1))
         keys = jax.vmap(online.split)(self.keys)
 
         def record(setup: online.Setup, keys: Any, thetas: Any, states: Any) -> Any:
@@ -83,9 +85,11 @@ class Plan:
         recorder, evaluator = recorder.result(), evaluator.result()
 
         def advance(states: online.State) -> tuple[online.State, online.RoundInfo]:
+            thetas = jax.numpy.asarray(self.truths.at(int(states.round[0]) + 1))
             recordings = recorder(setup, keys.record, thetas, states)
             states, infos = updater(setup, keys.update, states, recordings)
-            return states, infos.replace(return_target=evaluator(setup, keys.evaluate, thetas, states))
+            returned, cost = evaluator(setup, keys.evaluate, thetas, states)
+            return states, infos.replace(return_target=returned, cost_target=cost)
 
         return advance
 
@@ -104,15 +108,17 @@ def make_plan(settings: Settings) -> Plan:
 
 def _make_plan(settings: Settings) -> Plan:
     entry = systems.lookup(settings.system)
-    if settings.target == "gymnasium" and settings.system not in GYMNASIUM:
-        raise ValueError(f"Gymnasium has no environment for {settings.system}; add --target simulated.")
     names = entry.system().parameters.names
     _check_names(settings.prior, names, "prior")
     system = entry.system(**settings.prior, noise=settings.noise)
-    task = entry.task()
+    controller = entry.learner if settings.controller == "auto" else settings.controller
+    planned = controller in control.PLANNERS
+    if planned and entry.planned is None:
+        raise ValueError(f"{settings.system} has no task that one can plan for; take --controller {entry.learner}.")
+    task = entry.planned() if planned and entry.planned else entry.task()
     box = system.parameters
     pace = dataclasses.asdict(Schedule()) | _checked(dataclasses.asdict(Schedule()), settings.schedule, "schedule")
-    learner, habits = _learner(settings.system, system, task, settings.learner)
+    learner, habits = _learner(controller, settings, system, task)
     sizes = ("steps", "simulations", "recordings", "evaluations", "pool", "history", "calibrations", "components")
     setup = online.Setup.create(
         system,
@@ -120,21 +126,41 @@ def _make_plan(settings: Settings) -> Plan:
         task,
         estimator=_estimator(settings, system.actions.size, Schedule(**pace)),
         proposal=settings.proposal,
+        replay=planned,
+        forget=settings.forget,
         **{name: getattr(settings, name) for name in sizes},
     )
     seeds = list(range(settings.seed, settings.seed + settings.seeds))
-    truths = np.stack([_truth(settings, box, seed) for seed in seeds])
-    if settings.target == "simulated":
-        target = SimulatedTarget(system, task, truths[0])
-    else:
-        target = gymnasium_target(settings.system, truths[0], system.noise)
+    truths = _truths(settings, box, seeds)
+    kind, target = _target(settings, system, task, truths.at(1)[0], rescored=planned)
     complete = dataclasses.replace(
         settings,
+        target=kind,
+        controller=controller,
         prior={n: (_short(a), _short(b)) for n, a, b in zip(names, box.low, box.high, strict=True)},
         schedule=pace,
         learner={name: value for name, value in habits.items() if value is not None},
     )
     return Plan(complete, setup, target, seeds, truths)
+
+
+def _target(settings: Settings, system: Any, task: Any, truth: Any, *, rescored: bool) -> tuple[Any, Any]:
+    """What the settings' target is called once it is chosen, and the target."""
+    name, kind = settings.system, settings.target
+    if kind == "auto":
+        kind = "gymnasium" if name in GYMNASIUM else "simulated"
+    if kind == "simulated":
+        return kind, SimulatedTarget(system, task, truth)
+    if kind == "vehicle":
+        if not isinstance(system, systems.SkidSteer):
+            raise ValueError(f"the target vehicle is a skid-steered one; {name} has none: take another --target.")
+        vehicle: Any = SkidSteerVehicle(system)
+        on_vehicle: Any = OnVehicle(task)
+        return kind, SimulatedTarget(vehicle, on_vehicle, truth)
+    if name not in GYMNASIUM:
+        raise ValueError(f"Gymnasium has no environment for {name}; add --target simulated.")
+    target = gymnasium_target(name, truth, system.noise)
+    return kind, Rescored(target, system, task, truth) if rescored else target
 
 
 def _estimator(settings: Settings, actions: int, schedule: Schedule) -> Any:
@@ -145,21 +171,31 @@ def _estimator(settings: Settings, actions: int, schedule: Schedule) -> Any:
     return recurrent_mixture(settings.encoder, settings.components, schedule)
 
 
-def _truth(settings: Settings, box: Box, seed: int) -> Float[np.ndarray, " d"]:
-    """The hidden parameters of a seed: those given, the others drawn from the prior."""
+def _truths(settings: Settings, box: Box, seeds: list[int]) -> Truths:
+    """The hidden parameters of every seed: those given, the others drawn from the prior; and what becomes of them."""
     _check_names(settings.truth, box.names, "truth")
-    key = jax.random.fold_in(jax.random.key(seed), TRUTH)
-    drawn = np.array(box.low + jax.random.uniform(key, (box.size,)) * box.width)
-    low, high = np.asarray(box.low), np.asarray(box.high)
-    for i, name in enumerate(box.names):
-        if name in settings.truth:
-            drawn[i] = settings.truth[name]
-            if not low[i] <= drawn[i] <= high[i]:
-                raise ValueError(
-                    f"truth {name}={settings.truth[name]} lies outside the prior, {_short(low[i])} to "
-                    f"{_short(high[i])} {box.units[i]}; choose another or widen [prior] in a config file."
-                )
-    return drawn
+    changed = {name: value for name, value in settings.change.items() if name != "round"}
+    _check_names(changed, box.names, "change")
+    if settings.change and not changed:
+        raise ValueError("change names no parameter; add one, such as --change round=10 NAME=NUMBER.")
+
+    def placed(drawn: np.ndarray, given: Mapping[str, float], what: str) -> np.ndarray:
+        low, high = np.asarray(box.low), np.asarray(box.high)
+        for i, name in enumerate(box.names):
+            if name in given:
+                drawn[:, i] = given[name]
+                if not (low[i] <= drawn[:, i]).all() or not (drawn[:, i] <= high[i]).all():
+                    raise ValueError(
+                        f"{what} {name}={given[name]} lies outside the prior, {_short(low[i])} to "
+                        f"{_short(high[i])} {box.units[i]}; choose another or widen [prior] in a config file."
+                    )
+        return drawn
+
+    keys = [jax.random.fold_in(jax.random.key(seed), TRUTH) for seed in seeds]
+    drawn = np.stack([np.array(box.low + jax.random.uniform(key, (box.size,)) * box.width) for key in keys])
+    first = placed(drawn, settings.truth, "truth")
+    later = placed(first.copy(), changed, "change")
+    return Truths(first, later, int(settings.change["round"]) if settings.change else None)
 
 
 def _check_names(given: Iterable[str], known: Iterable[str], what: str) -> None:
@@ -168,13 +204,19 @@ def _check_names(given: Iterable[str], known: Iterable[str], what: str) -> None:
             raise ValueError(f"{what}: unknown parameter {name!r}: {near_miss(name, known)}")
 
 
-def _learner(system_name: str, system: Any, task: Any, changes: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
+def _learner(name: str, settings: Settings, system: Any, task: Any) -> tuple[Any, dict[str, Any]]:
     """The learner of a system with the values of a config table, and all its values."""
-    name, chosen = learning.DEFAULTS[system_name]
-    create = learning.LEARNERS[name].create
-    parameters = inspect.signature(create).parameters.values()
+    if name in control.PLANNERS:
+        create, makers = control.Planner.create, (control.Planner.create, control.Disco.create, control.Mppi.create)
+        chosen = control.default_settings(name, settings.system) | {"components": settings.components}
+    else:
+        create = learning.LEARNERS[name].create
+        makers = (create,)
+        usual, habits = learning.DEFAULTS[settings.system]
+        chosen = habits if usual == name else {}
+    parameters = [p for maker in makers for p in inspect.signature(maker).parameters.values()]
     values = {p.name: p.default for p in parameters if p.default is not p.empty} | chosen
-    values |= _checked(values, changes, "learner")
+    values |= _checked(values, settings.learner, "learner")
     return create(system, task, **values), values
 
 
@@ -187,8 +229,10 @@ def _checked(values: Mapping[str, Any], changes: Mapping[str, Any], table: str) 
         old = values[name]
         whole = isinstance(old, int) and not isinstance(old, bool)
         kinds = (int,) if whole else (list, tuple) if isinstance(old, tuple) else (int, float)
+        kinds = (str,) if isinstance(old, str) else kinds
         if type(new) not in kinds:
             wanted = "a whole number" if whole else "a list" if isinstance(old, tuple) else "a number"
+            wanted = "a word" if isinstance(old, str) else wanted
             raise ValueError(f"[{table}]: {name} is {new!r}; it needs {wanted}.")
         checked[name] = tuple(new) if isinstance(old, tuple) else new
     return checked

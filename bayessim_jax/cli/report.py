@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from bayessim_jax.cli.parsing import UsageError
 from bayessim_jax.recordings.files import write_text
-from bayessim_jax.recordings.posterior import read_draws
+from bayessim_jax.recordings.posterior import read_draws, read_history
 from bayessim_jax.recordings.run_folder import RunFolder
+from bayessim_jax.report.drives import Drives, Scene
 from bayessim_jax.report.evidence import OnlineRun
 from bayessim_jax.report.online import render
 
@@ -34,9 +37,10 @@ def report(words: Sequence[str]) -> int:
 
 def read_run(folder: RunFolder) -> OnlineRun:
     """What a run folder says, as the report wants it; raises `ValueError` where a file is damaged."""
-    read = read_draws(folder.path / "posterior.nc")
+    read, settings = read_draws(folder.path / "posterior.nc"), folder.read_config()
+    drives, scene = _control(folder, settings, read.draws)
     return OnlineRun(
-        settings=folder.read_config(),
+        settings=settings,
         facts=folder.read_run(),
         lines=folder.read_metrics(len(read.draws)),
         draws=read.draws,
@@ -45,7 +49,28 @@ def read_run(folder: RunFolder) -> OnlineRun:
         low=read.low,
         high=read.high,
         truths=read.truths,
+        drives=drives,
+        scene=scene,
     )
+
+
+def _control(folder: RunFolder, settings: dict[str, Any], draws: np.ndarray) -> tuple[Drives | None, Scene | None]:
+    """What a planner did on the target, and the scene of its last recording."""
+    if settings.get("controller") not in ("mppi", "disco"):
+        return None, None
+    from bayessim_jax.cli.config_file import settings_from
+    from bayessim_jax.cli.options import Settings
+    from bayessim_jax.cli.plan import make_plan
+    from bayessim_jax.cli.scene import replan
+
+    plan = make_plan(Settings(**settings_from(settings, str(folder.path / "config.toml"))))
+    system, path = plan.setup.system, folder.path / "posterior.nc"
+    seen = read_history(path, system.observations, system.actions)
+    first = {name: getattr(seen, name)[:, 0, 0] for name in ("times", "observations", "rewards", "valid")}
+    drives = Drives(channels=tuple(system.observations.names), **first)
+    before = draws[-2, 0] if len(draws) > 1 else None
+    planner: Any = plan.setup.learner
+    return drives, replan(planner, drives, len(draws), before)
 
 
 def write_report(folder: RunFolder) -> Path:

@@ -133,7 +133,8 @@ class Session:
 
     def _opening(self, before: dict[str, Any]) -> dict[str, Any]:
         device, plan, now = jax.devices()[0], self.plan, _now()
-        columns = [plan.truths[:, i].astype(float).tolist() for i in range(plan.truths.shape[1])]
+        hidden = plan.truths.first
+        columns = [hidden[:, i].astype(float).tolist() for i in range(hidden.shape[1])]
         truth = {
             name: column if len(plan.seeds) > 1 else column[0]
             for name, column in zip(plan.setup.system.parameters.names, columns, strict=True)

@@ -83,7 +83,7 @@ class Corrected:
         """The widened Gaussian; the prior itself while the belief is the prior."""
         scale_tril = jnp.linalg.cholesky(belief.covariance())
         wide = GaussianMixture(jnp.zeros(1), belief.mean()[None], self.widening * scale_tril[None])
-        return Truncated.create(wide, belief.box, belief.prior_share)
+        return Truncated.create(wide, belief.box, jnp.where(belief.prior_share > 0.5, belief.prior_share, 0.0))
 
     def combine(self, belief: Truncated, proposal: Truncated, q: GaussianMixture) -> Truncated:
         """The quotient q / p̃ on the prior's box; q itself where p̃ was the prior."""

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from bayessim_jax.learning.fixed import Fixed as Fixed
 from bayessim_jax.learning.fixed import RandomPolicy as RandomPolicy
+from bayessim_jax.learning.fixed import RecordedActions as RecordedActions
 from bayessim_jax.learning.policies import NetworkPolicy as NetworkPolicy
 from bayessim_jax.learning.ppo import Ppo as Ppo
 from bayessim_jax.learning.sac import Sac as Sac
@@ -21,6 +22,7 @@ __all__ = [
     "NetworkPolicy",
     "Ppo",
     "RandomPolicy",
+    "RecordedActions",
     "Sac",
     "default_learner",
 ]
@@ -36,8 +38,8 @@ DEFAULTS: dict[str, tuple[str, dict[str, Any]]] = {
 """For each registered system: its learner, and the settings that learn its task in 15,000 policy steps a round.
 
 Episodes are as long as the task's: in the 50 steps of a recording a pole never meets the end of its track and an
-acrobot never reaches its line. The skid-steer robot is driven by a planner in the paper: SAC learns here
-to stay near the circle, but hardly to go around it.
+acrobot never reaches its line. The skid-steer robot is planned for by default: SAC learns here to stay near
+the circle, but hardly to go around it.
 """
 
 

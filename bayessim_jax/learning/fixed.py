@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayessim_jax.contracts import Belief, Box, Discrete, Policy, Scalar
 
-__all__ = ["Fixed", "FixedInfo", "RandomPolicy"]
+__all__ = ["Fixed", "FixedInfo", "RandomPolicy", "RecordedActions"]
 
 
 @struct.dataclass
@@ -33,6 +33,23 @@ class RandomPolicy:
         return jax.random.uniform(
             key, self.actions.low.shape, minval=self.actions.low, maxval=self.actions.high
         ), memory
+
+
+@struct.dataclass
+class RecordedActions:
+    """The actions of a recording in their order, whatever is observed; its memory is the number of those taken."""
+
+    actions: Float[Array, "steps act"]
+
+    def init(self) -> Int[Array, ""]:
+        """None yet."""
+        return jnp.zeros((), jnp.int32)
+
+    def act(
+        self, key: PRNGKeyArray, memory: Int[Array, ""], observation: Float[Array, " obs"]
+    ) -> tuple[Float[Array, " act"], Int[Array, ""]]:
+        """The next one; the last is repeated."""
+        return self.actions[memory], jnp.minimum(memory + 1, self.actions.shape[0] - 1)
 
 
 @struct.dataclass

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
 from bayessim_jax.contracts import System
 from bayessim_jax.recordings.board import Board
@@ -15,6 +14,7 @@ from bayessim_jax.recordings.history import History
 from bayessim_jax.recordings.posterior import read_history, write_posterior
 from bayessim_jax.recordings.run_folder import RunFolder
 from bayessim_jax.recordings.summaries import metrics_line, summarize
+from bayessim_jax.recordings.truths import Truths
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -39,7 +39,7 @@ class Journal:
         folder: RunFolder,
         system: System[Any],
         seeds: Sequence[int],
-        truths: Float[np.ndarray, "seed d"],
+        truths: Truths,
         settings: Mapping[str, Any],
         attributes: Mapping[str, Any],
         simulations: int,
@@ -88,11 +88,11 @@ class Journal:
         """Put round `index` (from 1) of all seeds on disk, the checkpoint last, and return its lines."""
         box = self.system.parameters
         keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(self.keys, index)
-        summaries, infos = jax.device_get((_summarize(keys, infos.belief, self.truths, DRAWS), infos))
+        summaries, infos = jax.device_get((_summarize(keys, infos.belief, self.truths.at(index), DRAWS), infos))
         at = lambda tree, i: jax.tree.map(lambda leaf: leaf[i], tree)  # noqa: E731
         total = self.simulations * len(self.seeds)
         lines = [
-            metrics_line(index, seed, box, total, seconds, at(summaries, i), at(infos, i))
+            metrics_line(index, seed, box, total, seconds, at(summaries, i), at(infos, i), self.truths.at(index)[i])
             for i, seed in enumerate(self.seeds)
         ]
         latest = History.of_round(summaries.draws, infos.recordings)
@@ -116,6 +116,6 @@ class Journal:
             self.system.actions,
             self.prior,
             self.seeds,
-            self.truths,
+            self.truths.at(self.history.rounds),
             self.attributes,
         )

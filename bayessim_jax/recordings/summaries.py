@@ -54,13 +54,21 @@ def summarize(key: PRNGKeyArray, belief: Belief, truth: Float[Array, " d"], n: i
 
 
 def metrics_line(
-    index: int, seed: int, parameters: Box, simulations: int, seconds: float, summary: Summary, info: RoundInfo
+    index: int,
+    seed: int,
+    parameters: Box,
+    simulations: int,
+    seconds: float,
+    summary: Summary,
+    info: RoundInfo,
+    truth: Float[np.ndarray, " d"],
 ) -> dict[str, Any]:
     """The line of `metrics.jsonl` for one round (counted from 1) of one seed.
 
     `log_prob_true` is in raw units of θ; `log_prob_true_scaled` is the density of θ divided by the prior's width,
     log q(θ*) + Σ log(high − low), and `gain_over_prior` is log q(θ*) − log p(θ*): for a uniform prior they are equal.
-    `simulations` counts the trajectories of all seeds that shared the `seconds` of the round.
+    `truth` is θ* in that round. `simulations` counts the trajectories of all seeds that shared the `seconds` of the
+    round.
     """
     named = lambda values: dict(zip(parameters.names, np.asarray(values, float).tolist(), strict=True))  # noqa: E731
     width = float(np.log(np.asarray(parameters.width, float)).sum())
@@ -72,6 +80,7 @@ def metrics_line(
         "log_prob_true_scaled": log_prob_true + width,
         "gain_over_prior": log_prob_true + width,
         "return_target": float(info.return_target),
+        "cost_target": float(info.cost_target),
         "return_simulated": float(np.mean(info.learning.return_mean)),
         "seconds": seconds,
         "simulations_per_second": simulations / max(seconds, 1e-9),
@@ -92,6 +101,7 @@ def metrics_line(
         "widen": float(info.calibration.widen),
         "level_true": float(summary.level_true),
         "rank_true": named(summary.rank_true),
+        "truth": named(truth),
         "mean": named(summary.mean),
         "sd": named(summary.sd),
     }

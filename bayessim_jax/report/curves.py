@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["estimates_plot", "log_density_plot", "plot_seeds", "return_plot", "set_rounds"]
+__all__ = ["cost_over_rounds", "estimates_plot", "log_density_plot", "plot_seeds", "return_plot", "set_rounds"]
 
 
 def plot_seeds(
@@ -58,6 +58,22 @@ def return_plot(target: Float[np.ndarray, "seed round"], simulated: Float[np.nda
     return draw_svg(4.8, 3.0, draw, "return")
 
 
+def cost_over_rounds(cost: Float[np.ndarray, "seed round"], change: int | None) -> str:
+    """Mean cost of a step on the target after each round, and when the target changed."""
+
+    def draw(figure: Figure) -> None:
+        ax = figure.subplots()
+        plot_seeds(ax, cost, BLUE, "on the target")
+        if change is not None:
+            ax.axvline(change - 0.5, color=ORANGE, linestyle=":", linewidth=1.2, label="the target changes")
+        set_rounds(ax, cost.shape[1])
+        ax.set_ylim(bottom=0)
+        ax.set_ylabel("mean cost of a step")
+        ax.legend(loc="best")
+
+    return draw_svg(4.8, 3.0, draw, "cost")
+
+
 def log_density_plot(log_prob: Float[np.ndarray, "seed round"], log_prior: float) -> str:
     """The density log q(θ*) over rounds, in raw units of θ, beside that of the prior."""
 
@@ -79,7 +95,7 @@ def estimates_plot(
     units: Sequence[str],
     low: Float[np.ndarray, " d"],
     high: Float[np.ndarray, " d"],
-    truth: Float[np.ndarray, "seed d"] | None,
+    truth: Float[np.ndarray, "seed round d"] | None,
 ) -> str:
     """Posterior mean with one and two standard deviations for one seed; for several, the mean minus the truth."""
     seeds, rounds, d = mean.shape
@@ -89,7 +105,7 @@ def estimates_plot(
     def one(ax: Axes, i: int) -> None:
         x = np.arange(1, rounds + 1)
         if seeds > 1 and truth is not None:
-            plot_seeds(ax, mean[:, :, i] - truth[:, None, i], BLUE, "posterior mean − truth")
+            plot_seeds(ax, mean[:, :, i] - truth[:, :, i], BLUE, "posterior mean − truth")
             ax.axhline(0.0, color=ORANGE, linewidth=1.2, label="truth")
             ax.set_ylabel(quantity(f"error of {names[i]}", units[i]))
         else:
@@ -100,7 +116,10 @@ def estimates_plot(
                     ax.fill_between(x, lower, upper, color=BLUE, alpha=alpha, linewidth=0, label=label)
             plot_seeds(ax, mean[:, :, i], BLUE, "posterior mean")
             if truth is not None:
-                ax.axhline(truth[0, i], color=ORANGE, linewidth=1.2, label="truth")
+                if np.ptp(truth[0, :, i]):
+                    ax.step(x, truth[0, :, i], where="mid", color=ORANGE, linewidth=1.2, label="truth")
+                else:
+                    ax.axhline(truth[0, 0, i], color=ORANGE, linewidth=1.2, label="truth")
             for bound, label in ((low[i], "prior's bounds"), (high[i], None)):
                 ax.axhline(bound, color=GREY, linestyle="--", linewidth=0.9, label=label)
             ax.set_ylabel(quantity(names[i], units[i]))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
+
+from bayessim_jax.report.drives import Drives, Scene
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -27,6 +29,10 @@ class OnlineRun:
     low: Float[np.ndarray, " d"]
     high: Float[np.ndarray, " d"]
     truths: Float[np.ndarray, "seed d"] | None = None
+    """After the last round."""
+    drives: Drives | None = None
+    """What the target showed, where a planner acted."""
+    scene: Scene | None = None
 
     @property
     def rounds(self) -> int:
@@ -52,8 +58,18 @@ class OnlineRun:
         each = [self._replaced(name, parameter).series(name) for parameter in self.names]
         return np.stack(each, axis=-1)
 
+    def truth_over_rounds(self) -> Float[np.ndarray, "seed round d"] | None:
+        """θ* in every round, where it is known."""
+        if self.truths is None:
+            return None
+        told = self.vectors("truth")
+        return np.where(np.isfinite(told), told, self.truths[:, None])
+
+    def truth_at(self, index: int) -> Float[np.ndarray, " d"] | None:
+        """θ* of the first seed in a round, counted from 1."""
+        known = self.truth_over_rounds()
+        return None if known is None else known[0, index - 1]
+
     def _replaced(self, name: str, parameter: str) -> OnlineRun:
         lines = [{**line, name: (line.get(name) or {}).get(parameter)} for line in self.lines]
-        return OnlineRun(
-            self.settings, self.facts, lines, self.draws, self.names, self.units, self.low, self.high, self.truths
-        )
+        return replace(self, lines=lines)

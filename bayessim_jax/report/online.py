@@ -8,15 +8,18 @@ from typing import Any
 import numpy as np
 
 from bayessim_jax.report import html
-from bayessim_jax.report.curves import estimates_plot, log_density_plot, return_plot
+from bayessim_jax.report.curves import cost_over_rounds, estimates_plot, log_density_plot, return_plot
+from bayessim_jax.report.drives import cost_plot, drive_animation, paths_plot, shown_rounds
 from bayessim_jax.report.evidence import OnlineRun
 from bayessim_jax.report.pairs import pair_plot
 from bayessim_jax.report.trust import coverage_plot, rank_plot, truth_coverage_plot
+from bayessim_jax.report.viewer import SCRIPT_HASH, script
 from bayessim_jax.report.words import headline, number, plus_minus, worries
 
 __all__ = ["render"]
 
 SHOWN = (1, 5, 15)
+SHOWN_OF_PLANNERS = (1, 2)
 SEEDS_FOR_RANKS = 8
 
 
@@ -32,6 +35,7 @@ def render(run: OnlineRun) -> str:
         f'<p class="soft">{html.escape(_circumstances(run))}</p>',
         f'<p class="lead">{html.escape(headline(run))}</p>',
         *notices,
+        *([html.section("Control", *_control(run))] if run.drives else []),
         html.section("Posterior", *_posterior(run)),
         html.section("Over rounds", *_over_rounds(run)),
         html.section("Calibration", *_calibration(run)),
@@ -39,21 +43,48 @@ def render(run: OnlineRun) -> str:
         html.section("Settings", _settings(run)),
         f"<footer>{html.escape(_origin(run))}</footer>",
     ]
-    return html.page(title, "\n".join(body))
+    moving = run.scene is not None
+    page = "\n".join(body)
+    return html.page(title, page, script=script(), script_hash=SCRIPT_HASH) if moving else html.page(title, page)
+
+
+def _control(run: OnlineRun) -> list[str]:
+    """What a planner did on the target."""
+    drives, scene = run.drives, run.scene
+    assert drives is not None
+    rounds = ", ".join(str(r) for r in shown_rounds(run.rounds))
+    which = f" (seed {run.seeds[0]}, the first of {len(run.seeds)})" if len(run.seeds) > 1 else ""
+    figures = []
+    if scene is not None:
+        caption = (
+            f"The drives of rounds {rounds}{which}, each under what was believed before it; round 1 under the prior."
+        )
+        figures.append(
+            html.figure(paths_plot(drives, scene.radius), "Paths around the circle, round by round.", caption)
+        )
+    caption = f"Mean cost of a step so far, while rounds {rounds} were recorded{which}."
+    figures.append(html.figure(cost_plot(drives), "Mean cost of a step so far, over time.", caption))
+    if scene is not None:
+        caption = (
+            f"Round {run.rounds}: a few of the plans that are weighed at each moment, their weighted mean, and the way "
+            "taken. They were planned again along the recorded poses, and are drawn under the mean of the belief."
+        )
+        figures.append(drive_animation(scene, caption))
+    return [html.figures(*figures)]
 
 
 def _posterior(run: OnlineRun) -> list[str]:
-    truth = None if run.truths is None else run.truths[0]
-    marks = "Shaded: 50 %, 90 % and 99 % credible sets; dashed: the prior"
-    marks += "; orange: the truth." if truth is not None else "."
+    marks = "Shaded: 50 %, 90 % and 99 % credible sets; dashed, grey: the prior"
+    marks += "; dashed, orange: the truth." if run.truths is not None else "."
     which = f" (seed {run.seeds[0]}, the first of {len(run.seeds)})" if len(run.seeds) > 1 else ""
     figures = []
-    common = (run.names, run.units, run.low, run.high, truth)
-    for index in sorted({r for r in SHOWN if r <= run.rounds} | {run.rounds}):
-        svg = pair_plot(run.draws[index - 1, 0], *common, f"pair{index}")
+    common = (run.names, run.units, run.low, run.high)
+    shown = SHOWN_OF_PLANNERS if run.drives else SHOWN
+    for index in sorted({r for r in shown if r <= run.rounds} | {run.rounds}):
+        svg = pair_plot(run.draws[index - 1, 0], *common, run.truth_at(index), f"pair{index}")
         alt = f"Pair plot of the posterior after round {index}: {', '.join(run.names)}."
         figures.append(html.figure(svg, alt, f"Round {index}{which}. {marks}"))
-    svg = pair_plot(run.draws[-1, 0], *common, "magnified", magnify=True)
+    svg = pair_plot(run.draws[-1, 0], *common, run.truth_at(run.rounds), "magnified", magnify=True)
     alt = f"Pair plot of the posterior after round {run.rounds}, magnified."
     figures.append(html.figure(svg, alt, f"Round {run.rounds}{which}, magnified to where the posterior lies."))
     least = "24rem" if len(run.names) <= 2 else "34rem"
@@ -81,12 +112,18 @@ def _over_rounds(run: OnlineRun) -> list[str]:
     if np.isfinite(target).any() or np.isfinite(simulated).any():
         caption = "Return of an episode: the deterministic policy on the target, and the exploring one in simulation."
         figures.append(html.figure(return_plot(target, simulated), "Return against rounds.", caption))
+    change = (run.settings.get("change") or {}).get("round")
+    if run.drives:
+        caption = "Mean cost of a step on the target, in an episode after each round"
+        caption += f"; θ* changes before round {int(change)}." if change else "."
+        svg = cost_over_rounds(run.series("cost_target"), int(change) if change else None)
+        figures.append(html.figure(svg, "Cost of a step against rounds.", caption))
     if run.truths is not None:
         log_prior = -float(np.log(run.high - run.low).sum())
         svg = log_density_plot(run.series("log_prob_true"), log_prior)
         caption = "Log density of the truth under the posterior, in raw units of θ; higher is better."
         figures.append(html.figure(svg, "Log-likelihood, log q of the true parameters, against rounds.", caption))
-    shape = (run.names, run.units, run.low, run.high, run.truths)
+    shape = (run.names, run.units, run.low, run.high, run.truth_over_rounds())
     svg = estimates_plot(run.vectors("mean"), run.vectors("sd"), *shape)
     alt = "Posterior mean of each parameter against rounds."
     figures.append(html.figure(svg, alt, "What each round concluded.", wide=True))
@@ -99,6 +136,7 @@ def _rounds_table(run: OnlineRun) -> str:
         "log_prob_true_scaled": "in prior's units",
         "gain_over_prior": "gain over prior",
         "return_target": "return, target",
+        "cost_target": "cost of a step",
         "return_simulated": "return, simulated",
         "log_q_validation": "held-out log q",
         "coverage90": "coverage of 90 %",
@@ -183,6 +221,7 @@ def _circumstances(run: OnlineRun) -> str:
     s = run.settings
     seeds = f"seeds {run.seeds[0]} to {run.seeds[-1]}" if len(run.seeds) > 1 else f"seed {run.seeds[0]}"
     target = {"gymnasium": "Gymnasium's environment as the target", "simulated": "a simulated target"}
+    target["vehicle"] = "a vehicle that slips as the target"
     parts = [target.get(str(s.get("target")), "a real target"), seeds, f"proposal {s.get('proposal', '–')}"]
     parts.append(f"{s.get('simulations', '–')} simulations of {s.get('steps', '–')} steps a round")
     return " · ".join(parts)

@@ -33,7 +33,7 @@ def pair_plot(
     """Marginal densities on the diagonal, 50 %, 90 % and 99 % credible sets below it, as an `<svg>`.
 
     Axes span the prior, whose density is the dashed line; magnified, they span the posterior (and the truth beside
-    it). The truth, where it is known, is an orange line and cross.
+    it). The truth, where it is known, is a dashed orange line and a cross.
     """
     d = draws.shape[1]
     limits = [_around(draws[:, i], low[i], high[i], truth, i) if magnify else (low[i], high[i]) for i in range(d)]
@@ -45,7 +45,7 @@ def pair_plot(
         height = 1 / (high[i] - low[i])
         ax.plot([low[i], low[i], high[i], high[i]], [0, height, height, 0], color=GREY, linewidth=1.0, linestyle="--")
         if truth is not None:
-            ax.axvline(truth[i], color=ORANGE, linewidth=1.3)
+            ax.axvline(truth[i], color=ORANGE, linewidth=1.3, linestyle=(0, (5, 2)))
         ax.set_ylim(0, 1.1 * max(density.max(), height))
         ax.set_yticks([])
         ax.spines["left"].set_visible(False)
@@ -60,8 +60,8 @@ def pair_plot(
             ax.contourf(x, y, density, levels=top, colors=shades)
             ax.contour(x, y, density, levels=levels, colors=BLUE, linewidths=0.7)
         if truth is not None:
-            ax.axvline(truth[j], color=ORANGE, linewidth=0.7, alpha=0.7)
-            ax.axhline(truth[i], color=ORANGE, linewidth=0.7, alpha=0.7)
+            ax.axvline(truth[j], color=ORANGE, linewidth=0.9, alpha=0.8, linestyle=(0, (5, 2)))
+            ax.axhline(truth[i], color=ORANGE, linewidth=0.9, alpha=0.8, linestyle=(0, (5, 2)))
             ax.plot(truth[j], truth[i], "+", color=ORANGE, markersize=8, markeredgewidth=1.8)
         ax.set_ylim(*limits[i])
 

@@ -10,9 +10,11 @@ from bayessim_jax.systems.acrobot import Acrobot as Acrobot
 from bayessim_jax.systems.acrobot import Raise as Raise
 from bayessim_jax.systems.cartpole import Balance as Balance
 from bayessim_jax.systems.cartpole import CartPole as CartPole
+from bayessim_jax.systems.cartpole import Centre as Centre
 from bayessim_jax.systems.functional import from_functions as from_functions
 from bayessim_jax.systems.pendulum import Pendulum as Pendulum
 from bayessim_jax.systems.pendulum import SwingUp as SwingUp
+from bayessim_jax.systems.pendulum import Upswing as Upswing
 from bayessim_jax.systems.skid_steer import FollowCircle as FollowCircle
 from bayessim_jax.systems.skid_steer import SkidSteer as SkidSteer
 
@@ -26,19 +28,29 @@ __all__ = ["SYSTEMS", "Entry", "lookup"]
 
 @dataclass(frozen=True)
 class Entry:
-    """A registered system: how to make it, its task, and the learner that is trained on it."""
+    """A registered system: how to make it, its task, and the learner that is trained on it.
+
+    `planned` is the task of planners, who need a cost that falls on the way to the goal; none plans without one.
+    """
 
     system: Callable[..., System[Any]]
     task: Callable[..., Task[Any]]
     learner: str
     summary: str
+    planned: Callable[..., Task[Any]] | None = None
 
 
 SYSTEMS: dict[str, Entry] = {
-    "cartpole": Entry(CartPole.create, Balance, "ppo", "keep a pole upright on a cart that is pushed left or right"),
-    "pendulum": Entry(Pendulum.create, SwingUp, "sac", "swing a rod up with a motor too weak to lift it at once"),
+    "cartpole": Entry(
+        CartPole.create, Balance, "ppo", "keep a pole upright on a cart that is pushed left or right", Centre
+    ),
+    "pendulum": Entry(
+        Pendulum.create, SwingUp, "sac", "swing a rod up with a motor too weak to lift it at once", Upswing
+    ),
     "acrobot": Entry(Acrobot.create, Raise, "ppo", "swing two links up with a motor at the elbow only"),
-    "skid_steer": Entry(SkidSteer.create, FollowCircle, "sac", "drive around a circle on wheels that slide sideways"),
+    "skid_steer": Entry(
+        SkidSteer.create, FollowCircle, "mppi", "drive around a circle on wheels that slide sideways", FollowCircle
+    ),
 }
 
 

@@ -65,6 +65,11 @@ class Acrobot:
         """Every coordinate uniform in ±0.1."""
         return AcrobotState(*jax.random.uniform(key, (4,), minval=-0.1, maxval=0.1))
 
+    def restart(self, theta: Float[Array, " d"], observation: Float[Array, " obs"]) -> AcrobotState:
+        """The angles of the measured cosines and sines, and both rates."""
+        cos1, sin1, cos2, sin2, rate1, rate2 = observation
+        return AcrobotState(jnp.arctan2(sin1, cos1), jnp.arctan2(sin2, cos2), rate1, rate2)
+
     def step(self, theta: Float[Array, " d"], state: AcrobotState, action: Float[Array, " act"]) -> AcrobotState:
         """One Runge-Kutta step; angles are wrapped to ±π."""
         torque = action[0] - 1.0

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from bayessim_jax.contracts import Box, Discrete, Scalar
 
-__all__ = ["Balance", "CartPole", "CartPoleState"]
+__all__ = ["Balance", "CartPole", "CartPoleState", "Centre"]
 
 
 @struct.dataclass
@@ -64,6 +64,10 @@ class CartPole:
         """Every coordinate uniform in ±0.05."""
         return CartPoleState(*jax.random.uniform(key, (4,), minval=-0.05, maxval=0.05))
 
+    def restart(self, theta: Float[Array, " d"], observation: Float[Array, " obs"]) -> CartPoleState:
+        """All four coordinates are seen."""
+        return CartPoleState(*observation)
+
     def step(self, theta: Float[Array, " d"], state: CartPoleState, action: Float[Array, " act"]) -> CartPoleState:
         """One explicit Euler step."""
         length, mass = theta[0], theta[1]
@@ -98,3 +102,24 @@ class Balance:
     def terminated(self, state: CartPoleState) -> Bool[Array, ""]:
         """Out of the track or fallen."""
         return (jnp.abs(state.x) > 2.4) | (jnp.abs(state.angle) > 12 * 2 * jnp.pi / 360)
+
+
+@struct.dataclass
+class Centre:
+    """Keep the pole up and the cart at the centre, as DISCO is told: reward −(x² + 500 sin² φ + v² + ω²).
+
+    An episode ends as that of `Balance` does.
+
+    Source: Barcelos et al. 2020
+    """
+
+    steps: int = struct.field(pytree_node=False, default=500)
+
+    def reward(self, state: CartPoleState, action: Float[Array, " act"], next_state: CartPoleState) -> Scalar:
+        """Minus the cost of the state that the action led to."""
+        upright = 500.0 * jnp.sin(next_state.angle) ** 2
+        return -(next_state.x**2 + upright + next_state.x_dot**2 + next_state.angle_dot**2)
+
+    def terminated(self, state: CartPoleState) -> Bool[Array, ""]:
+        """Out of the track or fallen."""
+        return Balance(self.steps).terminated(state)

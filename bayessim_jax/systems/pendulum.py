@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from bayessim_jax.contracts import Box, Discrete, Scalar
 
-__all__ = ["Pendulum", "PendulumState", "SwingUp"]
+__all__ = ["Pendulum", "PendulumState", "SwingUp", "Upswing"]
 
 
 @struct.dataclass
@@ -57,6 +57,11 @@ class Pendulum:
         angle, angle_dot = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0)
         return PendulumState(jnp.pi * angle, angle_dot)
 
+    def restart(self, theta: Float[Array, " d"], observation: Float[Array, " obs"]) -> PendulumState:
+        """The angle of the measured cosine and sine, which noise takes off the unit circle."""
+        cos, sin, angle_dot = observation
+        return PendulumState(jnp.arctan2(sin, cos), angle_dot)
+
     def step(self, theta: Float[Array, " d"], state: PendulumState, action: Float[Array, " act"]) -> PendulumState:
         """One semi-implicit Euler step."""
         length, mass = theta[0], theta[1]
@@ -81,6 +86,24 @@ class SwingUp:
         angle = jnp.mod(state.angle + jnp.pi, 2 * jnp.pi) - jnp.pi
         torque = jnp.clip(action[0], -2.0, 2.0)
         return -(angle**2 + 0.1 * state.angle_dot**2 + 0.001 * torque**2)
+
+    def terminated(self, state: PendulumState) -> Bool[Array, ""]:
+        """Never."""
+        return jnp.zeros((), bool)
+
+
+@struct.dataclass
+class Upswing:
+    """Swing up and stay, as DISCO is told: reward −(50 (cos φ − 1)² + ω²) of the state reached; no episode ends early.
+
+    Source: Barcelos et al. 2020
+    """
+
+    steps: int = struct.field(pytree_node=False, default=200)
+
+    def reward(self, state: PendulumState, action: Float[Array, " act"], next_state: PendulumState) -> Scalar:
+        """Minus the cost of the state that the action led to."""
+        return -(50.0 * (jnp.cos(next_state.angle) - 1.0) ** 2 + next_state.angle_dot**2)
 
     def terminated(self, state: PendulumState) -> Bool[Array, ""]:
         """Never."""

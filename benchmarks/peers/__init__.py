@@ -12,9 +12,10 @@ CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os
 """Cores this process may use."""
 
 
-def require_peers() -> None:
-    """Exit with one line where the extra is not installed."""
-    missing = [name for name in ("torch", "stable_baselines3", "sbi") if importlib.util.find_spec(name) is None]
+def require_peers(*names: str) -> None:
+    """Exit with one line where the modules named, or those of most benchmarks, are not installed."""
+    wanted = names or ("torch", "stable_baselines3", "sbi")
+    missing = [name for name in wanted if importlib.util.find_spec(name) is None]
     if missing:
         raise SystemExit(
             f"benchmarks: {', '.join(missing)} not found; pip install 'bayessim-jax[peers]' and try again."

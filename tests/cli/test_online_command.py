@@ -102,7 +102,7 @@ def test_bad_config(capsys, tmp_path, text, message):
 
 
 def test_a_system_that_gymnasium_does_not_have(capsys, tmp_path):
-    told = refused(capsys, "skid_steer", "--out", tmp_path / "run")
+    told = refused(capsys, "skid_steer", "--target", "gymnasium", "--out", tmp_path / "run")
     assert told == "bayessim: Gymnasium has no environment for skid_steer; add --target simulated.\n"
     assert not (tmp_path / "run").exists()
 
@@ -159,15 +159,15 @@ def test_a_plan_is_complete_and_repeats():
     assert plan.settings.schedule["epochs"] > 0
     assert plan.settings.learner["envs"] > 0
     assert plan.seeds == [5, 6]
-    lengths, masses = plan.truths.T
+    lengths, masses = plan.truths.first.T
     assert masses == pytest.approx([0.3, 0.3])
     assert lengths[0] != lengths[1]
     assert ((lengths >= 0.2) & (lengths <= 0.8)).all()
     again = make_plan(plan.settings)
     assert again.settings == plan.settings
-    np.testing.assert_array_equal(again.truths, plan.truths)
+    np.testing.assert_array_equal(again.truths.first, plan.truths.first)
     alone = make_plan(Settings("cartpole", seed=6, truth={"mass": 0.3}, prior={"length": (0.2, 0.8)}))
-    np.testing.assert_array_equal(alone.truths[0], plan.truths[1])
+    np.testing.assert_array_equal(alone.truths.first[0], plan.truths.first[1])
 
 
 def lines(path):
@@ -227,7 +227,7 @@ def test_the_command_does_what_the_library_does(tmp_path):
     told = lines(tmp_path / "run")
     np.testing.assert_allclose([line["log_q_validation"] for line in told], infos.fit.log_q_validation, rtol=1e-3)
     np.testing.assert_array_equal([line["return_target"] for line in told], infos.return_target)
-    exact = jax.vmap(lambda belief: belief.log_prob(jnp.asarray(plan.truths[0])))(infos.belief)
+    exact = jax.vmap(lambda belief: belief.log_prob(jnp.asarray(plan.truths.first[0])))(infos.belief)
     np.testing.assert_allclose([line["log_prob_true"] for line in told], exact, atol=1e-3)
 
 
@@ -271,3 +271,47 @@ def test_a_process_that_is_stopped_goes_on_as_if_it_had_not_been(tmp_path, numbe
         xr.open_datatree(cut / "posterior.nc", engine="h5netcdf") as b,
     ):
         xr.testing.assert_identical(a, b)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("acrobot --controller disco", "acrobot has no task that one can plan for; take --controller ppo"),
+        ("cartpole --target vehicle", "cartpole has none: take another --target"),
+        ("pendulum --change length=0.5", "change needs the round from which it holds"),
+        ("pendulum --change round=3", "change names no parameter"),
+        ("pendulum --change round=3 length=4", "change length=4.0 lies outside the prior"),
+        ("pendulum --forget 1", "forget is 1.0; it is a probability"),
+    ],
+)
+def test_bad_words_of_control(capsys, tmp_path, words, message):
+    assert message in refused(capsys, *words.split(), "--out", tmp_path / "run")
+
+
+def test_planners_take_their_settings_and_targets():
+    plan = make_plan(Settings("pendulum", controller="disco", learner={"samples": 7, "noise": "spline"}))
+    assert (plan.settings.target, plan.settings.learner["samples"], plan.setup.replay) == ("gymnasium", 7, True)
+    change = {"round": 3.0, "icr_offset": -0.2}
+    skid = make_plan(Settings("skid_steer", target="vehicle", truth={"icr_offset": 0.1}, change=change))
+    assert (skid.settings.controller, skid.truths.at(2)[0, 2], skid.truths.at(3)[0, 2]) == (
+        "mppi",
+        np.float32(0.1),
+        np.float32(-0.2),
+    )
+    np.testing.assert_array_equal(skid.truths.at(2)[0, :2], skid.truths.at(3)[0, :2])
+    assert make_plan(Settings("pendulum", controller="ppo")).settings.controller == "ppo"
+
+
+@pytest.mark.parametrize("system", ["skid_steer", "pendulum"])
+def test_a_planner_drives_through_the_command(tmp_path, system):
+    out = tmp_path / "run"
+    text = TINY[: TINY.index("[learner]")].replace('"cartpole"', f'"{system}"').replace("rounds = 3", "rounds = 2")
+    (tmp_path / "c.toml").write_text(text + "[learner]\nhorizon = 6\nsamples = 8\n")
+    words = ["--config", str(tmp_path / "c.toml"), "--controller", "disco", "--out", str(out), "--quiet"]
+    assert main(["online", system, *words, "--forget", "0.1"]) == 0
+    lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    assert len(lines) == 2
+    assert all(line["cost_target"] > 0 for line in lines)
+    page = (out / "report.html").read_text()
+    assert "Mean cost of a step so far" in page
+    assert ("Paths around the circle" in page) == ('class="wide animation"' in page) == (system == "skid_steer")

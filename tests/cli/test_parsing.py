@@ -24,7 +24,7 @@ def test_flags_fill_the_settings():
 def test_the_defaults_are_the_papers():
     settings = parse(Online, ["cartpole"], "bayessim online").settings
     assert (settings.rounds, settings.simulations, settings.steps, settings.components) == (30, 200, 50, 5)
-    assert (settings.target, settings.truth, settings.seeds) == ("gymnasium", {}, 1)
+    assert (settings.target, settings.truth, settings.seeds) == ("auto", {}, 1)
     assert str(Online(settings).folder) == "runs/cartpole-seed0"
 
 

@@ -12,6 +12,7 @@ from bayessim_jax.recordings.checkpoints import Checkpoints
 from bayessim_jax.recordings.journal import Journal
 from bayessim_jax.recordings.posterior import read_history
 from bayessim_jax.recordings.run_folder import RunFolder
+from bayessim_jax.recordings.truths import Truths
 from bayessim_jax.systems import CartPole, SkidSteer
 from tests.recordings.synthetic import SETTINGS, STATE, stacked, state_after
 
@@ -20,7 +21,7 @@ TRUTHS = np.array([[0.5, 0.4], [0.3, 0.7]], np.float32)
 
 
 def journal(folder, seeds=(3, 4), truths=TRUTHS):
-    return Journal(folder, SYSTEM, seeds, truths, SETTINGS, {"title": "test"}, simulations=10)
+    return Journal(folder, SYSTEM, seeds, Truths.constant(truths), SETTINGS, {"title": "test"}, simulations=10)
 
 
 def write(book, rounds, truths=TRUTHS, system=SYSTEM):
@@ -94,7 +95,7 @@ def test_one_seed_has_no_seed_dimension_and_no_truth_where_it_is_unknown(tmp_pat
 def test_channels_with_a_slash_are_variables_with_a_dot(tmp_path):
     system, truths = SkidSteer.create(), np.array([[0.06, 0.5, 0.1]], np.float32)
     folder = RunFolder(tmp_path / "robot").create()
-    with Journal(folder, system, [3], truths, SETTINGS, {"title": "test"}, simulations=10) as book:
+    with Journal(folder, system, [3], Truths.constant(truths), SETTINGS, {"title": "test"}, simulations=10) as book:
         write(book, [1, 2], truths, system)
     seen = groups(folder)["observed_data"]
     assert seen["base.yaw"].attrs["units"] == "rad"

@@ -54,7 +54,7 @@ def test_the_line_of_a_round():
     info = one_info(system, 2, [0.5, 0.4], overfit=True, log_q_validation=jnp.nan)
     two = jnp.array([0.5, 0.4])
     summary = Summary(two[None], two, two / 10, jnp.array(2.5), jnp.array(0.3), two)
-    line = metrics_line(2, 7, system.parameters, 600, 3.0, summary, info)
+    line = metrics_line(2, 7, system.parameters, 600, 3.0, summary, info, np.array([0.4, 0.3]))
     assert (line["round"], line["seed"], line["overfit"], line["overconfident"]) == (2, 7, True, False)
     assert line["simulations_per_second"] == pytest.approx(200)
     # the prior is uniform on [0.1, 1]²: log p = −2 log 0.9
@@ -63,3 +63,4 @@ def test_the_line_of_a_round():
     assert line["gain_over_prior"] == pytest.approx(2.5 + 2 * np.log(0.9), abs=1e-5)
     assert line["sd"] == pytest.approx({"length": 0.05, "mass": 0.04})
     assert (line["return_target"], line["return_simulated"]) == (40.0, 20.0)
+    assert (line["cost_target"], line["truth"]) == (pytest.approx(0.2), {"length": 0.4, "mass": 0.3})

@@ -85,7 +85,8 @@ def test_curves_survive_missing_numbers():
 def test_estimates_name_parameters_and_the_truth(seeds, known):
     mean = RNG.uniform(size=(seeds, 4, 3))
     truth = np.full((seeds, 3), 0.5) if known else None
-    svg = estimates_plot(mean, mean / 10, ["a", "b", "c"], ["m", "", "kg"], np.zeros(3), np.ones(3), truth)
+    over_rounds = None if truth is None else np.repeat(truth[:, None], mean.shape[1], 1)
+    svg = estimates_plot(mean, mean / 10, ["a", "b", "c"], ["m", "", "kg"], np.zeros(3), np.ones(3), over_rounds)
     seen = " ".join(words(svg))
     assert "a [m]" in seen
     assert "c [kg]" in seen
