@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from bayessim_jax.spelling import find_named
@@ -10,6 +11,8 @@ from bayessim_jax.systems.acrobot import Acrobot as Acrobot
 from bayessim_jax.systems.acrobot import Raise as Raise
 from bayessim_jax.systems.cartpole import Balance as Balance
 from bayessim_jax.systems.cartpole import CartPole as CartPole
+from bayessim_jax.systems.fetch import Fetch as Fetch
+from bayessim_jax.systems.fetch import MoveTo as MoveTo
 from bayessim_jax.systems.functional import from_functions as from_functions
 from bayessim_jax.systems.pendulum import Pendulum as Pendulum
 from bayessim_jax.systems.pendulum import SwingUp as SwingUp
@@ -39,6 +42,8 @@ SYSTEMS: dict[str, Entry] = {
     "pendulum": Entry(Pendulum.create, SwingUp, "sac", "swing a rod up with a motor too weak to lift it at once"),
     "acrobot": Entry(Acrobot.create, Raise, "ppo", "swing two links up with a motor at the elbow only"),
     "skid_steer": Entry(SkidSteer.create, FollowCircle, "sac", "drive around a circle on wheels that slide sideways"),
+    "fetch_push": Entry(partial(Fetch.create, "push"), MoveTo, "her", "push a box to a place on a table with an arm"),
+    "fetch_slide": Entry(partial(Fetch.create, "slide"), MoveTo, "her", "hit a puck so that it slides to a place"),
 }
 
 
