@@ -46,7 +46,9 @@ LEAST = {**dict.fromkeys(COUNTS, 1), "simulations": 10, "seed": 0, "evaluations"
 class Settings:
     """Everything that decides what a run computes; what `config.toml` holds."""
 
-    system: tyro.conf.Positional[Literal["cartpole", "pendulum", "acrobot", "skid_steer", "fetch_push", "fetch_slide"]]
+    system: tyro.conf.Positional[
+        Literal["cartpole", "pendulum", "acrobot", "skid_steer", "hopper", "fetch_push", "fetch_slide"]
+    ]
     """What to identify and control; see `bayessim systems`."""
     target: Literal["gymnasium", "simulated"] = "gymnasium"
     """The machine with hidden parameters: Gymnasium's environment, or this package's own system."""

@@ -35,6 +35,7 @@ __all__ = [
     "hide_acrobot",
     "hide_cartpole",
     "hide_fetch",
+    "hide_hopper",
     "hide_pendulum",
     "require_robotics",
 ]
@@ -69,6 +70,11 @@ def hide_fetch(env: Any, theta: np.ndarray) -> None:
         env.model.geom_friction[geom, 0] = float(theta[0])
 
 
+def hide_hopper(env: Any, theta: np.ndarray) -> None:
+    """Give `Hopper-v5` the sliding friction θ₁ on every geom, the floor's included."""
+    env.model.geom_friction[:, 0] = float(theta[0])
+
+
 def require_robotics() -> Path:
     """Where gymnasium-robotics is installed; `ValueError` in one line where it is not."""
     if importlib.util.find_spec("gymnasium_robotics") is None:
@@ -82,6 +88,7 @@ GYMNASIUM: dict[str, tuple[str, Callable[[Any, np.ndarray], None], float]] = {
     "cartpole": ("CartPole-v1", hide_cartpole, 0.02),
     "pendulum": ("Pendulum-v1", hide_pendulum, 0.05),
     "acrobot": ("Acrobot-v1", hide_acrobot, 0.2),
+    "hopper": ("Hopper-v5", hide_hopper, 0.008),
     "fetch_push": ("gymnasium_robotics:FetchPush-v4", hide_fetch, 0.04),
     "fetch_slide": ("gymnasium_robotics:FetchSlide-v4", hide_fetch, 0.04),
 }

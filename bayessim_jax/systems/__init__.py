@@ -14,6 +14,8 @@ from bayessim_jax.systems.cartpole import CartPole as CartPole
 from bayessim_jax.systems.fetch import Fetch as Fetch
 from bayessim_jax.systems.fetch import MoveTo as MoveTo
 from bayessim_jax.systems.functional import from_functions as from_functions
+from bayessim_jax.systems.hopper import Hop as Hop
+from bayessim_jax.systems.hopper import Hopper as Hopper
 from bayessim_jax.systems.pendulum import Pendulum as Pendulum
 from bayessim_jax.systems.pendulum import SwingUp as SwingUp
 from bayessim_jax.systems.skid_steer import FollowCircle as FollowCircle
@@ -42,6 +44,7 @@ SYSTEMS: dict[str, Entry] = {
     "pendulum": Entry(Pendulum.create, SwingUp, "sac", "swing a rod up with a motor too weak to lift it at once"),
     "acrobot": Entry(Acrobot.create, Raise, "ppo", "swing two links up with a motor at the elbow only"),
     "skid_steer": Entry(SkidSteer.create, FollowCircle, "sac", "drive around a circle on wheels that slide sideways"),
+    "hopper": Entry(Hopper.create, Hop, "ppo", "hop forward on one leg; the simulator is Brax, the target MuJoCo"),
     "fetch_push": Entry(partial(Fetch.create, "push"), MoveTo, "her", "push a box to a place on a table with an arm"),
     "fetch_slide": Entry(partial(Fetch.create, "slide"), MoveTo, "her", "hit a puck so that it slides to a place"),
 }

@@ -32,7 +32,7 @@ def test_the_defaults_are_the_papers():
     ("words", "message"),
     [
         ("cartpol", "unknown system 'cartpol': did you mean 'cartpole'?"),
-        ("", "bayessim online needs one of cartpole, pendulum, acrobot, skid_steer, fetch_push, fetch_slide"),
+        ("", "bayessim online needs one of cartpole, pendulum, acrobot, skid_steer, hopper, fetch_push, fetch_slide"),
         ("cartpole --ronds 3", "unknown flag '--ronds': did you mean '--rounds'?"),
         ("--sed=3 cartpole", "unknown flag '--sed': did you mean '--seed'?"),
         ("cartpole --prior 3", "--prior has no flag; set it in a table [prior] of a file for --config."),
