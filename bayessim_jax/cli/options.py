@@ -39,7 +39,14 @@ Pairs = Annotated[
     ),
 ]
 COUNTS = ("rounds", "seeds", "steps", "recordings", "pool", "history", "calibrations", "components")
-LEAST = {**dict.fromkeys(COUNTS, 1), "simulations": 10, "seed": 0, "evaluations": 0, "noise": 0.0}
+LEAST = {**dict.fromkeys(COUNTS, 1), "simulations": 10, "seed": 0, "evaluations": 0, "warmup": 0, "noise": 0.0}
+FETCH = {"noise": 0.001, "warmup": 3, "evaluations": 10, "history": 8, "calibrations": 64}
+HABITS: dict[str, dict[str, Any]] = {
+    "hopper": {"rounds": 50, "history": 8, "calibrations": 64},
+    "fetch_push": FETCH,
+    "fetch_slide": FETCH,
+}
+"""Defaults that differ where a system asks for it: simulations with contacts cost more, and Fetch is seen in metres."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +61,13 @@ class Settings:
     """The machine with hidden parameters: Gymnasium's environment, or this package's own system."""
     truth: Pairs = field(default_factory=dict)
     """True parameters to hide in the target; those not given are drawn from the prior by the seed."""
+    scheme: Literal["online", "offline", "uniform"] = "online"
+    """When to infer: in every round; once, from the policy after the warm-up, and then keep that posterior; or never,
+    which is domain randomization over the prior."""
+    warmup: int = 0
+    """Rounds before the first recording, in which the policy improves against the prior."""
     rounds: int = 30
-    """Rounds of the outer loop."""
+    """Rounds of the outer loop, warm-up included."""
     seed: int = 0
     """Seed of everything random; with several seeds, the first of them."""
     seeds: int = 1

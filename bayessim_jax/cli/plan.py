@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 __all__ = ["Plan", "make_plan"]
 
 TRUTH = 0x7275
+INFERENCES = {"online": online.FOREVER, "offline": 1, "uniform": 0}
 
 
 @dataclass(frozen=True)
@@ -70,22 +71,35 @@ class Plan:
             one = lambda k, state, seen: online.update(k, setup, state, seen)  # noqa: E731
             return _over_seeds(one, len(self.seeds))(keys, states, recordings)
 
+        def improve(setup: online.Setup, keys: Any, states: Any) -> Any:
+            one = lambda k, state: online.improve(k, setup, state)  # noqa: E731
+            return _over_seeds(one, len(self.seeds))(keys, states)
+
         def evaluate(setup: online.Setup, keys: Any, thetas: Any, states: Any) -> Any:
             one = lambda k, theta, state: online.evaluate(k, setup, self.target.replace(theta=theta), state)  # noqa: E731
             return _over_seeds(one, len(self.seeds))(keys, thetas, states)
 
         seen = jax.eval_shape(record, setup, keys.record, thetas, states)
         build = lambda f, *args: jax.jit(f, compiler_options=online.COMPILER_OPTIONS).lower(*args)  # noqa: E731
-        with ThreadPoolExecutor() as pool:  # the two are compiled while the third is traced
-            recorder = pool.submit(build(record, setup, keys.record, thetas, states).compile)
+        rounds = {bool(online.infers(setup, r)) for r in range(self.settings.rounds)}
+        with ThreadPoolExecutor() as pool:  # the others are compiled while the last is traced
             evaluator = pool.submit(build(evaluate, setup, keys.evaluate, thetas, states).compile)
-            updater = build(update, setup, keys.update, states, seen).compile()
-        recorder, evaluator = recorder.result(), evaluator.result()
+            recorder = (
+                pool.submit(build(record, setup, keys.record, thetas, states).compile) if True in rounds else None
+            )
+            improver = pool.submit(build(improve, setup, keys.update, states).compile) if False in rounds else None
+            updater = build(update, setup, keys.update, states, seen).compile() if True in rounds else None
 
         def advance(states: online.State) -> tuple[online.State, online.RoundInfo]:
-            recordings = recorder(setup, keys.record, thetas, states)
-            states, infos = updater(setup, keys.update, states, recordings)
-            return states, infos.replace(return_target=evaluator(setup, keys.evaluate, thetas, states))
+            if online.infers(setup, int(states.round[0])):
+                assert recorder is not None and updater is not None
+                recordings = recorder.result()(setup, keys.record, thetas, states)
+                states, infos = updater(setup, keys.update, states, recordings)
+            else:
+                assert improver is not None
+                states, infos = improver.result()(setup, keys.update, states)
+            returned, success = evaluator.result()(setup, keys.evaluate, thetas, states)
+            return states, infos.replace(return_target=returned, success_target=success)
 
         return advance
 
@@ -120,6 +134,8 @@ def _make_plan(settings: Settings) -> Plan:
         task,
         estimator=_estimator(settings, system.actions.size, Schedule(**pace)),
         proposal=settings.proposal,
+        warmup=settings.warmup,
+        inferences=INFERENCES[settings.scheme],
         **{name: getattr(settings, name) for name in sizes},
     )
     seeds = list(range(settings.seed, settings.seed + settings.seeds))

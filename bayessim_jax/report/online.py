@@ -99,6 +99,7 @@ def _rounds_table(run: OnlineRun) -> str:
         "log_prob_true_scaled": "in prior's units",
         "gain_over_prior": "gain over prior",
         "return_target": "return, target",
+        "success_target": "success, target",
         "return_simulated": "return, simulated",
         "log_q_validation": "held-out log q",
         "coverage90": "coverage of 90 %",
