@@ -1,4 +1,4 @@
-"""Benchmarks: `python -m benchmarks online | estimator | scaling | engines | concealed`."""
+"""Benchmarks: `python -m benchmarks online | estimator | scaling | engines | fetch | concealed`."""
 
 from __future__ import annotations
 
@@ -46,13 +46,19 @@ def main() -> None:
     engines.add_argument("--repeats", type=int, default=5)
     engines.add_argument("--mjx", type=int, default=1024, metavar="BATCH", help="batch of MJX; 0 leaves it out")
 
+    fetch = commands.add_parser("fetch", help="Fetch Push against mujoco.rollout and Stable-Baselines3's HER")
+    fetch.add_argument("--batch", type=int, default=64)
+    fetch.add_argument("--steps", type=int, default=50)
+    fetch.add_argument("--repeats", type=int, default=3)
+    fetch.add_argument("--peer-steps", type=int, default=2000, help="of the peer's training; 0 leaves it out")
+
     concealed = commands.add_parser("concealed", help="diagnoses of made-up machines with an effect concealed in them")
     concealed.add_argument("--rigs", nargs="+", default=["pendulum", "slide", "swing", "cart", "double"])
     concealed.add_argument("--cases", type=int, default=200)
     concealed.add_argument("--seed", type=int, default=1)
     concealed.add_argument("--out", type=Path, help="file of JSON lines to append cases to, and to resume from")
 
-    for command in (online, estimator, scaling, engines):
+    for command in (online, estimator, scaling, engines, fetch):
         command.add_argument("--clock", choices=CLOCKS, default="wall", help="cpu: seconds summed over threads")
 
     options = parser.parse_args()
@@ -75,6 +81,10 @@ def main() -> None:
         from benchmarks.engines import compare_engines
 
         compare_engines(options)
+    elif options.command == "fetch":
+        from benchmarks.fetch import compare_fetch
+
+        compare_fetch(options)
     else:
         from benchmarks.scaling import measure_scaling
 

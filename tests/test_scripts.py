@@ -1,4 +1,4 @@
-"""The programs that reproduce the paper's contact-rich experiments run from end to end at their smallest, and resume."""
+"""The programs that reproduce the contact-rich experiments run from end to end at their smallest, and resume."""
 
 import json
 import subprocess
