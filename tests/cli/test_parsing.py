@@ -1,3 +1,4 @@
+import dataclasses
 import subprocess
 import sys
 import typing
@@ -129,7 +130,22 @@ def test_systems_are_listed_with_priors_and_units(capsys):
         "pendulum",
         "acrobot",
         "skid_steer",
+        "hopper",
+        "fetch_push",
+        "fetch_slide",
     ]
+
+
+def test_a_system_whose_package_is_missing_is_listed_with_the_remedy(capsys, monkeypatch):
+    from bayessim_jax.systems import SYSTEMS
+
+    def missing():
+        raise ValueError("Fetch needs gymnasium-robotics: pip install it.")
+
+    monkeypatch.setitem(SYSTEMS, "fetch_push", dataclasses.replace(SYSTEMS["fetch_push"], system=missing))
+    assert main(["systems"]) == 0
+    assert "fetch_push: push a box" in (told := capsys.readouterr().out)
+    assert "  Fetch needs gymnasium-robotics: pip install it.\n" in told
 
 
 @pytest.mark.parametrize("words", [["--help"], ["--version"], ["online", "--help"], ["online", "cartpol"]])
