@@ -172,15 +172,16 @@ def test_the_choices_are_those_of_the_registries():
 
 
 def test_the_defaults_are_those_of_the_library():
-    import dataclasses
     import inspect
 
     from bayessim_jax import online
+    from bayessim_jax.cli.plan import INFERENCES
     from bayessim_jax.inference.estimators import recurrent_mixture
 
     settings = Settings("cartpole")
     for field in dataclasses.fields(online.Setup):
-        if field.default is not dataclasses.MISSING:
+        if field.name != "inferences" and field.default is not dataclasses.MISSING:
             assert getattr(settings, field.name) == field.default, field.name
+    assert INFERENCES[settings.scheme] == online.Setup.inferences
     assert settings.proposal == inspect.signature(online.Setup.create).parameters["proposal"].default
     assert settings.encoder == inspect.signature(recurrent_mixture).parameters["encoder"].default
