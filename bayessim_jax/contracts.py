@@ -18,6 +18,7 @@ __all__ = [
     "Box",
     "Discrete",
     "Estimator",
+    "GoalTask",
     "Learner",
     "Policy",
     "Recording",
@@ -154,6 +155,23 @@ class Task(Protocol[S]):
 
     def terminated(self, state: S) -> Bool[Array, ""]:
         """Whether the episode ends in this state."""
+        ...
+
+
+@runtime_checkable
+class GoalTask(Task[S], Protocol[S]):
+    """A task with a goal that each episode draws: it is a part of the observation, and what is paid is known for any.
+
+    Episodes last the whole of `steps`: such a task never terminates.
+    """
+
+    goal: tuple[int, ...]
+    """Channels of the observation that say what is asked for."""
+    achieved: tuple[int, ...]
+    """Channels that say what is the case, in the same order and units."""
+
+    def pay(self, achieved: Float[Array, " goal"], goal: Float[Array, " goal"]) -> Scalar:
+        """Reward of a transition after which `achieved` is the case, had `goal` been asked for."""
         ...
 
 

@@ -24,7 +24,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bayessim_jax.beliefs import Truncated
-from bayessim_jax.contracts import Estimator, Learner, Policy, Recording, Scalar, System, Target, Task
+from bayessim_jax.contracts import Estimator, GoalTask, Learner, Policy, Recording, Scalar, System, Target, Task
 from bayessim_jax.inference.estimators import recurrent_mixture
 from bayessim_jax.inference.proposals import ProposalMode, lookup_proposal, pool_weights
 from bayessim_jax.learning.fixed import RecordedActions
@@ -32,12 +32,15 @@ from bayessim_jax.rollout import rollout
 
 __all__ = [
     "COMPILER_OPTIONS",
+    "FOREVER",
     "Keys",
     "Pool",
     "RoundInfo",
     "Setup",
     "State",
     "evaluate",
+    "improve",
+    "infers",
     "init",
     "record",
     "run",
@@ -49,6 +52,10 @@ __all__ = [
 
 COMPILER_OPTIONS = {"xla_backend_optimization_level": 1}
 """For `jax.jit(run, …, compiler_options=…)`: a whole run compiles faster and takes as long."""
+
+
+FOREVER = 2**30
+"""More rounds than any run has."""
 
 
 @struct.dataclass
@@ -83,6 +90,11 @@ class Setup:
     forget: float = struct.field(pytree_node=False, default=0.0)
     """Probability that θ of the target changed between two rounds. Above 0, simulations are made for what the prior
     allows too, and recordings that contradict the newest one no longer count."""
+    warmup: int = struct.field(pytree_node=False, default=0)
+    """Rounds before the first recording, in which only the policy improves, against the prior."""
+    inferences: int = struct.field(pytree_node=False, default=FOREVER)
+    """Rounds, after these, that record and infer: all of them for the paper's loop, one for a posterior found once
+    with the policy of that moment and then kept, none for domain randomization over the prior."""
 
     @classmethod
     def create(
@@ -99,7 +111,7 @@ class Setup:
     ) -> Setup:
         """The paper's settings, unless told otherwise; the prior is uniform on `system.parameters`."""
         for name, value in sizes.items():
-            if value < (0 if name == "evaluations" else 1):
+            if value < (0 if name in ("evaluations", "warmup", "inferences") else 1):
                 raise ValueError(f"Setup: {name} is {value}; it must be a positive number.")
         if not 0 <= forget < 1:
             raise ValueError(f"Setup: forget is {forget}; it is a probability, from 0 to below 1.")
@@ -160,6 +172,8 @@ class RoundInfo:
     """Mean return of the evaluation episodes on the target; NaN where none is run."""
     cost_target: Scalar
     """Minus the mean reward of a step in them."""
+    success_target: Scalar
+    """Share of them that were at their goal in the end; NaN where the task has no goal."""
     diverged: Int[Array, ""]
     """Simulations of this round that were masked because a number was not finite."""
     pool_size: Scalar
@@ -236,15 +250,29 @@ def record(key: PRNGKeyArray, setup: Setup, target: Target, state: State) -> Rec
     return jax.vmap(lambda k: target.record(k, policy, setup.steps))(keys)
 
 
-def evaluate(key: PRNGKeyArray, setup: Setup, target: Target, state: State) -> tuple[Scalar, Scalar]:
-    """Mean return, and mean cost of a step, of the deterministic policy in `setup.evaluations` full episodes."""
+def evaluate(key: PRNGKeyArray, setup: Setup, target: Target, state: State) -> dict[str, Scalar]:
+    """How the deterministic policy fares in `setup.evaluations` full episodes on the target.
+
+    Returns these fields of `RoundInfo`: mean return, mean cost of a step, and the share that was at its goal in the
+    end. NaN where there is no task, no episode, or no goal.
+    """
+    nothing = jnp.array(jnp.nan)
     if setup.task is None or setup.evaluations == 0:
-        return jnp.array(jnp.nan), jnp.array(jnp.nan)
-    policy, steps = setup.learner.policy(state.learner, deterministic=True), setup.task.steps
+        return {"return_target": nothing, "cost_target": nothing, "success_target": nothing}
+    policy, task = setup.learner.policy(state.learner, deterministic=True), setup.task
     keys = jax.random.split(jax.random.fold_in(key, state.round), setup.evaluations)
-    seen = jax.vmap(lambda k: target.record(k, policy, steps))(keys)
+    seen = jax.vmap(lambda k: target.record(k, policy, task.steps))(keys)
     returns = seen.rewards.sum(-1)
-    return returns.mean(), -(returns / jnp.maximum(seen.valid.sum(-1), 1)).mean()
+    return {
+        "return_target": returns.mean(),
+        "cost_target": -(returns / jnp.maximum(seen.valid.sum(-1), 1)).mean(),
+        "success_target": jnp.mean(seen.rewards[:, -1] >= 0.0) if isinstance(task, GoalTask) else nothing,
+    }
+
+
+def infers(setup: Setup, round: Any) -> Any:
+    """Whether round number `round`, counted from 0, records and infers; in all others only the policy improves."""
+    return (round >= setup.warmup) & (round - setup.warmup < setup.inferences)
 
 
 def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording) -> tuple[State, RoundInfo]:
@@ -261,7 +289,8 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
         jax.random.fold_in(key, state.round), 5
     )
     policy = RecordedActions(recordings.actions) if setup.replay else setup.learner.policy(state.learner)
-    history, policies, use, newest = _remember(state, recordings, policy)
+    done = state.round - setup.warmup
+    history, policies, use, newest = _remember(state, done, recordings, policy)
 
     # simulate around the belief, every other draw under an earlier policy whose recordings still count
     known = state.belief.loosen(setup.forget) if setup.forget else state.belief
@@ -272,7 +301,7 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
     earlier = jax.random.categorical(slot_key, jnp.where(use, 0.0, -jnp.inf), shape=(fresh,))
     slots = jnp.where(jnp.arange(fresh) % 2 == 0, newest, jnp.where(use.any(), earlier, newest))
     simulated = simulate(simulate_key, setup, policies, thetas[:fresh], slots)
-    pool = _insert(state.pool, state.round, thetas[:fresh], jax.tree.map(lambda x: x[:, None], simulated), proposal)
+    pool = _insert(state.pool, done, thetas[:fresh], jax.tree.map(lambda x: x[:, None], simulated), proposal)
     weights = pool_weights(pool.thetas, pool.proposals, pool.filled, proposal).ravel()
     points, singles = jax.tree.map(_rows, (pool.thetas, pool.recordings))
     estimator, fit = setup.estimator.fit(fit_key, state.estimator, points, singles, weights)
@@ -303,6 +332,7 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
         learning=learning,
         return_target=jnp.array(jnp.nan),
         cost_target=jnp.array(jnp.nan),
+        success_target=jnp.array(jnp.nan),
         diverged=simulated.diverged.sum(),
         pool_size=weights.sum() ** 2 / (weights**2).sum(),
         uninformed=uninformed,
@@ -312,36 +342,64 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
     return jax.lax.optimization_barrier((after, info))
 
 
+def improve(key: PRNGKeyArray, setup: Setup, state: State) -> tuple[State, RoundInfo]:
+    """One round in which nothing is recorded and only the policy improves, against the belief as it is.
+
+    What its Info says of recordings, fit and calibration is zero, and NaN where that could be taken for a result.
+    """
+    state = jax.lax.optimization_barrier(state)
+    *_, learn_key = jax.random.split(jax.random.fold_in(key, state.round), 5)
+    learner, learning = setup.learner.step(learn_key, state.learner, state.belief)
+    one = jax.tree.map(lambda leaf: leaf[: setup.recordings], state.history)
+    shape = jax.eval_shape(lambda s, r: update(key, setup, s, r)[1], state, one)
+
+    def nothing(leaf: Any) -> Array:
+        return jnp.full(leaf.shape, jnp.nan if jnp.issubdtype(leaf.dtype, jnp.floating) else 0, leaf.dtype)
+
+    info = replace(
+        jax.tree.map(nothing, shape),
+        belief=state.belief,
+        recordings=jax.tree.map(jnp.zeros_like, one),
+        learning=learning,
+    )
+    return jax.lax.optimization_barrier((replace(state, round=state.round + 1, learner=learner), info))
+
+
 def run(
     key: PRNGKeyArray, setup: Setup, target: Target, state: State | None = None, *, rounds: int = 30
 ) -> tuple[State, RoundInfo]:
     """`rounds` rounds as one scan; the Info of every round is stacked. Continue by passing the state returned."""
     keys = split(key)
 
+    def infer(state: State) -> tuple[State, RoundInfo]:
+        return update(keys.update, setup, state, record(keys.record, setup, target, state))
+
     def one_round(state: State, _: None) -> tuple[State, RoundInfo]:
-        recordings = record(keys.record, setup, target, state)
-        state, info = update(keys.update, setup, state, recordings)
-        returned, cost = evaluate(keys.evaluate, setup, target, state)
-        return state, replace(info, return_target=returned, cost_target=cost)
+        if setup.warmup == 0 and setup.inferences == FOREVER:
+            state, info = infer(state)
+        else:
+            only = lambda state: improve(keys.update, setup, state)  # noqa: E731
+            state, info = jax.lax.cond(infers(setup, state.round), infer, only, state)
+        return state, replace(info, **evaluate(keys.evaluate, setup, target, state))
 
     return jax.lax.scan(one_round, init(keys.init, setup) if state is None else state, None, length=rounds)
 
 
-def _insert(pool: Pool, round_: Array, thetas: Array, recordings: Recording, proposal: Any) -> Pool:
+def _insert(pool: Pool, done: Array, thetas: Array, recordings: Recording, proposal: Any) -> Pool:
     """Overwrite the oldest slot."""
-    slot = round_ % pool.filled.shape[0]
+    slot = done % pool.filled.shape[0]
     return jax.tree.map(
         lambda leaf, new: leaf.at[slot].set(new), pool, Pool(thetas, recordings, proposal, jnp.ones(()))
     )
 
 
-def _remember(state: State, recordings: Recording, policy: Policy) -> tuple[Recording, Any, Array, Array]:
+def _remember(state: State, done: Array, recordings: Recording, policy: Policy) -> tuple[Recording, Any, Array, Array]:
     """Overwrite the oldest recordings and their policies; which slots hold a sound one; the slot of the newest."""
     size, new = state.history.diverged.size, recordings.diverged.size
-    rows = (state.round * new + jnp.arange(new)) % size
+    rows = (done * new + jnp.arange(new)) % size
     history = jax.tree.map(lambda leaf, part: leaf.at[rows].set(part), state.history, recordings)
     policies = jax.tree.map(lambda leaf, part: leaf.at[rows].set(part), state.policies, policy)
-    use = (jnp.arange(size) < (state.round + 1) * new) & ~history.diverged
+    use = (jnp.arange(size) < (done + 1) * new) & ~history.diverged
     return history, policies, use, rows[-1]
 
 

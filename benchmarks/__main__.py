@@ -1,4 +1,4 @@
-"""Benchmarks: `python -m benchmarks online | estimator | scaling | engines | concealed | mppi`."""
+"""Benchmarks: `python -m benchmarks online | estimator | scaling | engines | fetch | concealed | mppi`."""
 
 from __future__ import annotations
 
@@ -47,6 +47,12 @@ def main() -> None:
     engines.add_argument("--repeats", type=int, default=5)
     engines.add_argument("--mjx", type=int, default=1024, metavar="BATCH", help="batch of MJX; 0 leaves it out")
 
+    fetch = commands.add_parser("fetch", help="Fetch Push against mujoco.rollout and Stable-Baselines3's HER")
+    fetch.add_argument("--batch", type=int, default=64)
+    fetch.add_argument("--steps", type=int, default=50)
+    fetch.add_argument("--repeats", type=int, default=3)
+    fetch.add_argument("--peer-steps", type=int, default=2000, help="of the peer's training; 0 leaves it out")
+
     concealed = commands.add_parser("concealed", help="diagnoses of machines with effects concealed in them")
     concealed.add_argument(
         "--rigs", nargs="+", choices=_RIGS, help="machines; those without contacts and with motors if left out"
@@ -59,7 +65,7 @@ def main() -> None:
     mppi.add_argument("--repeats", type=int, default=7)
     _add_common(mppi)
 
-    for command in (online, estimator, scaling, engines, mppi):
+    for command in (online, estimator, scaling, engines, fetch, mppi):
         command.add_argument("--clock", choices=CLOCKS, default="wall", help="cpu: seconds summed over threads")
 
     options = parser.parse_args()
@@ -86,6 +92,10 @@ def main() -> None:
         from benchmarks.engines import compare_engines
 
         compare_engines(options)
+    elif options.command == "fetch":
+        from benchmarks.fetch import compare_fetch
+
+        compare_fetch(options)
     else:
         from benchmarks.scaling import measure_scaling
 

@@ -28,11 +28,12 @@ def trials(
     out: Path | None = None,
     labels: dict[str, Any] | None = None,
     draws: int = 512,
+    target: Callable[[Any], Any] | None = None,
 ) -> Iterator[dict[str, Any]]:
     """Yield, for each run, arrays over rounds: log q(θ*), the credible level and the ranks of θ*, mean log marginals.
 
-    With `out` every run is appended to that file of JSON lines, and runs that it holds already under the same `labels`,
-    seed and rounds are taken from there.
+    The target is the setup's own system, or what `target(θ*)` makes. With `out` every run is appended to that file of
+    JSON lines, and runs that it holds already under the same `labels`, seed and rounds are taken from there.
 
     `level` is the smallest highest-density credible level that holds θ*: uniform if calibrated. `rank` is the share of
     posterior draws below θ*, per axis. `log_marginals` are normal scores of pairs of axes (0, 1), (2, 3), ….
@@ -43,8 +44,8 @@ def trials(
     def one(key: Any) -> dict[str, Any]:
         truth_key, run_key, judge_key = jax.random.split(key, 3)
         truth = jax.random.uniform(truth_key, box.low.shape, minval=box.low, maxval=box.high)
-        target = SimulatedTarget(setup.system, setup.task, truth)
-        _, infos = online.run(run_key, setup, target, rounds=rounds)
+        hidden = SimulatedTarget(setup.system, setup.task, truth) if target is None else target(truth)
+        _, infos = online.run(run_key, setup, hidden, rounds=rounds)
 
         def judge(key: Any, belief: Any) -> dict[str, Any]:
             summary = summarize(key, belief, truth, draws)
@@ -61,6 +62,7 @@ def trials(
         return judged | {
             "truth": truth,
             "return_target": infos.return_target,
+            "success_target": infos.success_target,
             "coverage50": infos.calibration.coverage50,
             "coverage90": infos.calibration.coverage90,
             "coverage90_network": infos.calibration.coverage90_network,

@@ -74,6 +74,33 @@ def test_chunks_and_a_python_loop_are_the_whole_run_bit_for_bit(cartpole, run):
     _check_that_cuts_change_nothing(*cartpole, run)
 
 
+@pytest.mark.parametrize(("warmup", "inferences"), [(1, 2), (2, 0)])
+def test_cuts_change_nothing_where_only_some_rounds_infer(cartpole, run, warmup, inferences):
+    setup, target = cartpole
+    setup, key = setup.replace(warmup=warmup, inferences=inferences), jax.random.key(3)
+    keys = online.split(key)
+    start = jax.jit(online.init)(keys.init, setup)
+    whole, infos = run(key, setup, target, start, rounds=4)
+    inferred = jnp.array([warmup <= r < warmup + inferences for r in range(4)])
+    assert (jnp.isfinite(infos.fit.log_q_validation) == inferred).all()
+    assert (infos.recordings.valid.any((1, 2)) == inferred).all()
+    prior = jax.tree.map(lambda leaf: leaf[0], infos.belief)
+    assert _same(prior, start.belief)
+    last = jax.tree.map(lambda leaf: leaf[-1], infos.belief)
+    assert _same(last, whole.belief)
+    assert _same(last, start.belief) == (inferences == 0)
+    assert jnp.isfinite(infos.return_target).all()
+    assert whole.pool.filled.sum() == min(inferences, 2)
+
+    state, record = start, jax.jit(online.record)
+    for r in range(4):
+        if online.infers(setup, r):
+            state, _ = jax.jit(online.update)(keys.update, setup, state, record(keys.record, setup, target, state))
+        else:
+            state, _ = jax.jit(online.improve)(keys.update, setup, state)
+    assert _same(whole.learner, state.learner)
+
+
 @pytest.mark.slow
 def test_chunks_and_a_python_loop_are_the_whole_run_at_the_paper_s_sizes(run):
     system, task = CartPole.create(), Balance(steps=500)

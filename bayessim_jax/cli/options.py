@@ -39,19 +39,36 @@ Pairs = Annotated[
     ),
 ]
 COUNTS = ("rounds", "seeds", "steps", "recordings", "pool", "history", "calibrations", "components")
-LEAST = {**dict.fromkeys(COUNTS, 1), "simulations": 10, "seed": 0, "evaluations": 0, "noise": 0.0, "forget": 0.0}
+LEAST = {
+    **dict.fromkeys(COUNTS, 1),
+    "simulations": 10,
+    "seed": 0,
+    "evaluations": 0,
+    "warmup": 0,
+    "noise": 0.0,
+    "forget": 0.0,
+}
+FETCH = {"noise": 0.001, "warmup": 3, "evaluations": 10, "history": 8, "calibrations": 64}
+HABITS: dict[str, dict[str, Any]] = {
+    "hopper": {"rounds": 50, "history": 8, "calibrations": 64},
+    "fetch_push": FETCH,
+    "fetch_slide": FETCH,
+}
+"""Defaults that differ where a system asks for it: simulations with contacts cost more, and Fetch is seen in metres."""
 
 
 @dataclass(frozen=True)
 class Settings:
     """Everything that decides what a run computes; what `config.toml` holds."""
 
-    system: tyro.conf.Positional[Literal["cartpole", "pendulum", "acrobot", "skid_steer"]]
+    system: tyro.conf.Positional[
+        Literal["cartpole", "pendulum", "acrobot", "skid_steer", "hopper", "fetch_push", "fetch_slide"]
+    ]
     """What to identify and control; see `bayessim systems`."""
     target: Literal["auto", "gymnasium", "simulated", "vehicle"] = "auto"
     """The machine with hidden parameters: Gymnasium's environment, this package's own system, or for skid_steer a
     vehicle with late wheels that slip; auto is Gymnasium's where there is one, and the package's own elsewhere."""
-    controller: Literal["auto", "ppo", "sac", "mppi", "disco"] = "auto"
+    controller: Literal["auto", "ppo", "sac", "her", "mppi", "disco"] = "auto"
     """What acts: a policy that is trained, or a planner: mppi plans under the mean of the belief, disco under the
     belief; auto takes what suits the system."""
     truth: Pairs = field(default_factory=dict)
@@ -60,8 +77,13 @@ class Settings:
     """Other true parameters from a round on, such as round=10 length=0.8: what is not named stays as it was."""
     forget: float = 0.0
     """Probability that the true parameters change between two rounds; above 0 the belief follows a change."""
+    scheme: Literal["online", "offline", "uniform"] = "online"
+    """When to infer: in every round; once, from the policy after the warm-up, and then keep that posterior; or never,
+    which is domain randomization over the prior."""
+    warmup: int = 0
+    """Rounds before the first recording, in which the policy improves against the prior."""
     rounds: int = 30
-    """Rounds of the outer loop."""
+    """Rounds of the outer loop, warm-up included."""
     seed: int = 0
     """Seed of everything random; with several seeds, the first of them."""
     seeds: int = 1

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 __all__ = ["Plan", "make_plan"]
 
 TRUTH = 0x7275
+INFERENCES = {"online": online.FOREVER, "offline": 1, "uniform": 0}
 
 
 @dataclass(frozen=True)
@@ -72,24 +73,35 @@ class Plan:
             one = lambda k, state, seen: online.update(k, setup, state, seen)  # noqa: E731
             return _over_seeds(one, len(self.seeds))(keys, states, recordings)
 
+        def improve(setup: online.Setup, keys: Any, states: Any) -> Any:
+            one = lambda k, state: online.improve(k, setup, state)  # noqa: E731
+            return _over_seeds(one, len(self.seeds))(keys, states)
+
         def evaluate(setup: online.Setup, keys: Any, thetas: Any, states: Any) -> Any:
             one = lambda k, theta, state: online.evaluate(k, setup, self.target.replace(theta=theta), state)  # noqa: E731
             return _over_seeds(one, len(self.seeds))(keys, thetas, states)
 
         seen = jax.eval_shape(record, setup, keys.record, thetas, states)
         build = lambda f, *args: jax.jit(f, compiler_options=online.COMPILER_OPTIONS).lower(*args)  # noqa: E731
-        with ThreadPoolExecutor() as pool:  # the two are compiled while the third is traced
-            recorder = pool.submit(build(record, setup, keys.record, thetas, states).compile)
+        rounds = {bool(online.infers(setup, r)) for r in range(self.settings.rounds)}
+        with ThreadPoolExecutor() as pool:  # the others are compiled while the last is traced
             evaluator = pool.submit(build(evaluate, setup, keys.evaluate, thetas, states).compile)
-            updater = build(update, setup, keys.update, states, seen).compile()
-        recorder, evaluator = recorder.result(), evaluator.result()
+            recorder = (
+                pool.submit(build(record, setup, keys.record, thetas, states).compile) if True in rounds else None
+            )
+            improver = pool.submit(build(improve, setup, keys.update, states).compile) if False in rounds else None
+            updater = build(update, setup, keys.update, states, seen).compile() if True in rounds else None
 
         def advance(states: online.State) -> tuple[online.State, online.RoundInfo]:
             thetas = jax.numpy.asarray(self.truths.at(int(states.round[0]) + 1))
-            recordings = recorder(setup, keys.record, thetas, states)
-            states, infos = updater(setup, keys.update, states, recordings)
-            returned, cost = evaluator(setup, keys.evaluate, thetas, states)
-            return states, infos.replace(return_target=returned, cost_target=cost)
+            if online.infers(setup, int(states.round[0])):
+                assert recorder is not None and updater is not None
+                recordings = recorder.result()(setup, keys.record, thetas, states)
+                states, infos = updater(setup, keys.update, states, recordings)
+            else:
+                assert improver is not None
+                states, infos = improver.result()(setup, keys.update, states)
+            return states, infos.replace(**evaluator.result()(setup, keys.evaluate, thetas, states))
 
         return advance
 
@@ -128,6 +140,8 @@ def _make_plan(settings: Settings) -> Plan:
         proposal=settings.proposal,
         replay=planned,
         forget=settings.forget,
+        warmup=settings.warmup,
+        inferences=INFERENCES[settings.scheme],
         **{name: getattr(settings, name) for name in sizes},
     )
     seeds = list(range(settings.seed, settings.seed + settings.seeds))

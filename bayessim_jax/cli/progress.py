@@ -25,6 +25,8 @@ def describe(lines: Sequence[Mapping[str, Any]], left: float) -> str:
         parts.append(f"log q(θ*) {log_prob:6.2f}")
     if (returned := mean("return_target")) is not None:
         parts.append(f"return {returned:7.1f}")
+    if (success := mean("success_target")) is not None:
+        parts.append(f"success {success:4.2f}")
     parts.append(f"{lines[0]['simulations_per_second']:6.0f} simulations/s")
     parts.append(f"{_duration(left)} left")
     marks = ("overconfident", "over-confident"), ("overfit", "over-fitted"), ("collapsed", "collapsed")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from bayessim_jax.cli.config_file import differing, read_settings, settings_from
-from bayessim_jax.cli.options import Online, Settings
+from bayessim_jax.cli.options import HABITS, Online, Settings
 from bayessim_jax.cli.parsing import UsageError, parse
 from bayessim_jax.recordings.run_folder import RunFolder
 
@@ -28,6 +28,9 @@ def read_command(words: Sequence[str]) -> Online:
     told = read_settings(command.config) if command.config else {}
     if told or (elsewhere and not command.resume):
         command = _parse(words, told)
+    habits = HABITS.get(command.settings.system, {})
+    if habits and not command.resume:
+        command = _parse(words, {**habits, **told})
     if not command.resume:
         return command
     try:

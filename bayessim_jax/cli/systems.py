@@ -21,7 +21,11 @@ def systems(words: Sequence[str]) -> int:
     if words:
         raise UsageError(f"bayessim systems takes no arguments, but was given {words[0]!r}.")
     for name, entry in SYSTEMS.items():
-        system = entry.system()
+        try:
+            system = entry.system()
+        except ValueError as error:  # an optional package is missing
+            print(f"{name}: {entry.summary}\n  {error}\n")
+            continue
         box, seen = system.parameters, system.observations
         bounds = zip(box.names, box.low.tolist(), box.high.tolist(), box.units, strict=True)
         parameters = ", ".join(f"{n} {low:.3g} to {high:.3g} {unit}".rstrip() for n, low, high, unit in bounds)

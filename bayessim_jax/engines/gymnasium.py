@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib.util
+import io
 import itertools
 import threading
 from functools import cache, partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -23,7 +27,18 @@ from bayessim_jax.spelling import find_named
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["GYMNASIUM", "GymnasiumTarget", "gymnasium_target", "hide_acrobot", "hide_cartpole", "hide_pendulum"]
+__all__ = [
+    "GYMNASIUM",
+    "GymnasiumTarget",
+    "find_fetch_friction",
+    "gymnasium_target",
+    "hide_acrobot",
+    "hide_cartpole",
+    "hide_fetch",
+    "hide_hopper",
+    "hide_pendulum",
+    "require_robotics",
+]
 
 
 def hide_cartpole(env: Any, theta: np.ndarray) -> None:
@@ -44,12 +59,43 @@ def hide_acrobot(env: Any, theta: np.ndarray) -> None:
     env.LINK_COM_POS_1, env.LINK_COM_POS_2 = env.LINK_LENGTH_1 / 2, env.LINK_LENGTH_2 / 2
 
 
+def find_fetch_friction(model: Any) -> tuple[int, int]:
+    """The geoms of a Fetch model that slide on each other: the object's, and the table's."""
+    return int(model.geom("object0").id), int(model.body("table0").geomadr[0])
+
+
+def hide_fetch(env: Any, theta: np.ndarray) -> None:
+    """Give `FetchPush-v4` or `FetchSlide-v4` the sliding friction θ₁ between object and table, on both of them."""
+    for geom in find_fetch_friction(env.model):
+        env.model.geom_friction[geom, 0] = float(theta[0])
+
+
+def hide_hopper(env: Any, theta: np.ndarray) -> None:
+    """Give `Hopper-v5` the sliding friction θ₁ on every geom, the floor's included."""
+    env.model.geom_friction[:, 0] = float(theta[0])
+
+
+def require_robotics() -> Path:
+    """Where gymnasium-robotics is installed; `ValueError` in one line where it is not."""
+    if importlib.util.find_spec("gymnasium_robotics") is None:
+        raise ValueError("Fetch needs gymnasium-robotics: pip install 'bayessim-jax[fetch]' and try again.")
+    with contextlib.redirect_stderr(io.StringIO()):  # it prints news of other environments
+        import gymnasium_robotics
+    return Path(str(gymnasium_robotics.__file__)).parent
+
+
 GYMNASIUM: dict[str, tuple[str, Callable[[Any, np.ndarray], None], float]] = {
     "cartpole": ("CartPole-v1", hide_cartpole, 0.02),
     "pendulum": ("Pendulum-v1", hide_pendulum, 0.05),
     "acrobot": ("Acrobot-v1", hide_acrobot, 0.2),
+    "hopper": ("Hopper-v5", hide_hopper, 0.008),
+    "fetch_push": ("gymnasium_robotics:FetchPush-v4", hide_fetch, 0.04),
+    "fetch_slide": ("gymnasium_robotics:FetchSlide-v4", hide_fetch, 0.04),
 }
 """For each system: the environment, how θ is put into it, and its control period in s."""
+
+
+SHOWN = ("observation", "desired_goal")
 
 
 class _Pool:
@@ -65,7 +111,7 @@ class _Pool:
         self.lock = threading.Lock()
         self._add()
         self.discrete = isinstance(self.waiting[0].action_space, gymnasium.spaces.Discrete)
-        self.channels = int(np.prod(self.waiting[0].observation_space.shape))
+        self.channels = _count(self.waiting[0].observation_space)
 
     def reset(self, seeds: Any, thetas: Any) -> np.ndarray:
         """Begin episodes: (seed) and θ give (token, bits of the first observation), for any leading batch axes."""
@@ -80,7 +126,7 @@ class _Pool:
             observation, _ = env.reset(seed=int(seeds[index]))
             self.acting[token] = env
             result[index][0] = token
-            result[index][1:].view(np.float32)[:] = observation.ravel()
+            result[index][1:].view(np.float32)[:] = _flat(observation)
         return result
 
     def step(self, packed: Any) -> np.ndarray:
@@ -99,7 +145,8 @@ class _Pool:
                 continue
             if sound:
                 chosen = round(action.item()) if self.discrete else action
-                row[:-2], row[-2], terminated, truncated, _ = env.step(chosen)
+                observation, row[-2], terminated, truncated, _ = env.step(chosen)
+                row[:-2] = _flat(observation)
                 ended = terminated or truncated
             else:
                 row[:], ended = np.nan, True
@@ -111,6 +158,19 @@ class _Pool:
     def _add(self) -> None:
         self.waiting.append(self.make())
         self.made += 1
+
+
+def _count(space: Any) -> int:
+    """Numbers in `_flat` of what such a space holds."""
+    if isinstance(space, gymnasium.spaces.Dict):
+        return sum(_count(space[name]) for name in SHOWN)
+    return int(np.prod(space.shape or ()))
+
+
+def _flat(observation: Any) -> np.ndarray:
+    """An observation in a row; of a goal environment's the goal comes last, and what is achieved is left out."""
+    parts = [observation[name] for name in SHOWN] if isinstance(observation, dict) else [observation]
+    return np.concatenate([np.ravel(part) for part in parts])
 
 
 @cache
@@ -201,4 +261,6 @@ def gymnasium_target(
 ) -> GymnasiumTarget:
     """The Gymnasium environment behind a system of this package, or `ValueError` with the near miss."""
     env_id, configure, dt = find_named(name, GYMNASIUM, "no Gymnasium environment for the system")
+    if configure is hide_fetch:
+        require_robotics()
     return GymnasiumTarget.create(env_id, configure, theta, noise, dt)

@@ -68,9 +68,11 @@ class MujocoEngine:
         writes: Sequence[Write] = (),
         spec: mujoco.MjSpec | None = None,
         threads: int | None = None,
+        inputs: int = CTRL,
     ) -> None:
+        """`inputs` says which parts of MuJoCo's state (`mujoco.mjtState`) `drive` is given, in MuJoCo's order."""
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-        self.model, self.writes = model, tuple(writes)
+        self.model, self.writes, self.inputs = model, tuple(writes), inputs
         self.bank = ModelBank(model, writes, spec)
         self.threads = threads or count_cores()
         self.pool = rollout.Rollout(nthread=self.threads)
@@ -117,6 +119,30 @@ class MujocoEngine:
         inputs = (theta, state.physics, ctrls) if applied is None else (theta, state.physics, ctrls, applied)
         return MujocoState(*jax.pure_callback(call, shapes, *inputs, vmap_method="broadcast_all"))
 
+    def drive(
+        self, theta: Float[Array, " d"], state: MujocoState, inputs: Float[Array, " inputs"], steps: int = 1
+    ) -> tuple[MujocoState, Float[Array, " ns"]]:
+        """Advance by `steps` time steps under inputs that are held, and what the sensors show after them.
+
+        Sensors of forces and accelerations show those under the same inputs.
+        """
+        kind, model = state.qpos.dtype, self.model
+        shapes = (
+            jax.ShapeDtypeStruct((2 * self.rest.size,), jnp.uint32),
+            jax.ShapeDtypeStruct((model.nq,), kind),
+            jax.ShapeDtypeStruct((model.nv,), kind),
+            jax.ShapeDtypeStruct((model.nsensordata,), kind),
+        )
+        call = partial(self._drive, steps)
+        *after, seen = jax.pure_callback(call, shapes, theta, state.physics, inputs, vmap_method="broadcast_all")
+        return MujocoState(*after), seen
+
+    def clear(self, state: MujocoState, index: tuple[int, ...]) -> MujocoState:
+        """The same state with these entries of `qpos` zero; all others stay as they are to the last bit."""
+        rows = jnp.array(index)
+        bits = state.physics.reshape(-1, 2).at[1 + rows].set(0).ravel()
+        return MujocoState(bits, state.qpos.at[rows].set(0.0), state.qvel)
+
     def qpos(self, state: MujocoState) -> Float[Array, " nq"]:
         """Joint positions."""
         return state.qpos
@@ -149,11 +175,23 @@ class MujocoEngine:
         control = np.repeat(control, steps, axis=1) if steps > 1 else control
         spec = CTRL if applied is None else CTRL | APPLIED
         states, _ = self._rollout(theta, physics, control, spec, sensors=False)
-        ends = np.ascontiguousarray(states[:, steps - 1 :: steps]).reshape(*lead, periods, -1)
-        nq, nv, kind = self.model.nq, self.model.nv, np.asarray(theta).dtype
+        return self._show(states[:, steps - 1 :: steps].reshape(*lead, periods, -1), np.asarray(theta).dtype)
+
+    def _drive(self, steps: int, theta: Any, physics: Any, inputs: Any) -> tuple[np.ndarray, ...]:
+        """One time step more than asked for: it begins with the sensors of the state asked for, and is thrown away."""
+        physics, inputs, kind = np.asarray(physics), np.asarray(inputs), np.asarray(theta).dtype
+        lead = physics.shape[:-1]
+        held = np.repeat(inputs.reshape(math.prod(lead), 1, -1).astype(np.float64), steps + 1, axis=1)
+        states, seen = self._rollout(theta, physics, held, self.inputs, sensors=True)
+        after = self._show(states[:, steps - 1].reshape(*lead, -1), kind)
+        return *after, seen[:, steps].reshape(*lead, -1).astype(kind)
+
+    def _show(self, states: np.ndarray, kind: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The bits of states, and their positions and velocities as numbers of a kind."""
+        nq, nv = self.model.nq, self.model.nv
         with np.errstate(over="ignore"):
-            qpos, qvel = (part.astype(kind) for part in (ends[..., 1 : 1 + nq], ends[..., 1 + nq : 1 + nq + nv]))
-        return ends.view(np.uint32), qpos, qvel
+            qpos, qvel = (part.astype(kind) for part in (states[..., 1 : 1 + nq], states[..., 1 + nq : 1 + nq + nv]))
+        return np.ascontiguousarray(states).view(np.uint32), qpos, qvel
 
     def _sense(self, theta: Any, physics: Any, ctrl: Any) -> np.ndarray:
         """What the sensors show at the beginning of a time step, which is then thrown away."""

@@ -10,7 +10,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bayessim_jax.contracts import Belief, Scalar, System, Task
-from bayessim_jax.learning.heads import Head, draw, normal
+from bayessim_jax.learning.heads import Actor, draw, normal
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -88,7 +88,7 @@ def collect(
     task: Task[Any],
     belief: Belief,
     worlds: Worlds,
-    head: Head,
+    head: Actor,
     outputs: Callable[[Float[Array, "worlds obs"]], Float[Array, "worlds outputs"]],
     steps: int,
     episode_steps: int,

@@ -16,14 +16,24 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from bayessim_jax.contracts import Box, Discrete, Scalar
 
-__all__ = ["Categorical", "Gaussian", "Head", "SquashedGaussian", "choose_head", "draw", "normal"]
+__all__ = [
+    "Actor",
+    "Categorical",
+    "Explorer",
+    "Gaussian",
+    "Head",
+    "SquashedGaussian",
+    "choose_head",
+    "draw",
+    "normal",
+]
 
 _HALF_LOG_2PI = 0.9189385332046727
 _LOG_2 = 0.6931471805599453
 
 
-class Head(Protocol):
-    """A distribution over raw actions a, given network outputs p."""
+class Actor(Protocol):
+    """Makes raw actions a of network outputs p: what it takes to act."""
 
     @property
     def outputs(self) -> int:
@@ -47,16 +57,20 @@ class Head(Protocol):
         """The most probable raw action."""
         ...
 
+    def action(self, raw: Float[Array, " act"]) -> Float[Array, " act"]:
+        """The vector that the system takes, in its units."""
+        ...
+
+
+class Head(Actor, Protocol):
+    """A distribution over raw actions a, given network outputs p: what it takes to learn by its density."""
+
     def log_prob(self, p: Float[Array, " outputs"], raw: Float[Array, " act"]) -> Scalar:
         """Log density (or mass) of a raw action."""
         ...
 
     def entropy(self, p: Float[Array, " outputs"]) -> Scalar:
         """Entropy in nats."""
-        ...
-
-    def action(self, raw: Float[Array, " act"]) -> Float[Array, " act"]:
-        """The vector that the system takes, in its units."""
         ...
 
 
@@ -195,6 +209,48 @@ class SquashedGaussian:
     def action(self, raw: Float[Array, " act"]) -> Float[Array, " act"]:
         """Squashed and stretched to the box, in its units."""
         return _to_box(self.box, jnp.tanh(raw))
+
+
+@struct.dataclass
+class Explorer:
+    """tanh p, in half-widths of the box; to explore, Gaussian noise is added, or a uniform action takes its place.
+
+    Source: Plappert et al. 2018
+    """
+
+    box: Box
+    deviation: Scalar
+    """Standard deviation of the noise, in half-widths."""
+    random: Scalar
+    """Share of the actions that are uniform."""
+
+    @property
+    def outputs(self) -> int:
+        """One for each axis."""
+        return self.box.size
+
+    @property
+    def chances(self) -> int:
+        """Two numbers for each axis, and one that says which of them counts."""
+        return 2 * self.box.size + 1
+
+    def noise(self, uniform: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """The uniform numbers themselves."""
+        return uniform
+
+    def sample(self, p: Float[Array, " act"], noise: Float[Array, " chances"]) -> Float[Array, " act"]:
+        """An action to explore by, in half-widths of the box."""
+        size = self.box.size
+        noisy = jnp.clip(self.mode(p) + self.deviation * normal(noise[:size]), -1.0, 1.0)
+        return jnp.where(noise[-1] < self.random, 2.0 * noise[size : 2 * size] - 1.0, noisy)
+
+    def mode(self, p: Float[Array, " act"]) -> Float[Array, " act"]:
+        """The hyperbolic tangent of p."""
+        return jnp.tanh(p)
+
+    def action(self, raw: Float[Array, " act"]) -> Float[Array, " act"]:
+        """Stretched to the box, in its units."""
+        return _to_box(self.box, raw)
 
 
 def draw(key: PRNGKeyArray, shape: tuple[int, ...]) -> Array:

@@ -1,4 +1,4 @@
-"""Fixed scaling of what a network sees, from the box of the observations."""
+"""Scaling of what a network sees: fixed, from the box of the observations, or from what was seen so far."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from bayessim_jax.contracts import Box
+from bayessim_jax.contracts import Box, Scalar
 
-__all__ = ["Scaling"]
+__all__ = ["Moments", "Scaling"]
 
 
 @struct.dataclass
@@ -30,3 +30,32 @@ class Scaling:
     def normalise(self, observation: Float[Array, "*batch obs"]) -> Float[Array, "*batch obs"]:
         """Scaled observations, without unit."""
         return jnp.clip((observation - self.shift) / self.scale, -10.0, 10.0)
+
+
+@struct.dataclass
+class Moments:
+    """Number, mean and mean square deviation of everything seen so far.
+
+    Source: Chan, Golub and LeVeque 1983
+    """
+
+    count: Scalar
+    mean: Float[Array, " obs"]
+    variance: Float[Array, " obs"]
+
+    @classmethod
+    def create(cls, size: int) -> Moments:
+        """Nothing seen."""
+        return cls(jnp.zeros(()), jnp.zeros(size), jnp.zeros(size))
+
+    def add(self, rows: Float[Array, "rows obs"]) -> Moments:
+        """Take more rows in."""
+        new, total = rows.shape[0], self.count + rows.shape[0]
+        mean, variance = rows.mean(0), rows.var(0)
+        share, gap = new / total, mean - self.mean
+        spread = (1.0 - share) * self.variance + share * variance + share * (1.0 - share) * gap**2
+        return Moments(total, self.mean + share * gap, spread)
+
+    def scaling(self, least: float = 1e-2) -> Scaling:
+        """Mean and standard deviation, which is `least` at least; before anything was seen, 0 and 1."""
+        return Scaling(self.mean, jnp.where(self.count > 0, jnp.maximum(jnp.sqrt(self.variance), least), 1.0))

@@ -7,7 +7,7 @@ from typing import Any
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from bayessim_jax.learning.heads import Head, draw
+from bayessim_jax.learning.heads import Actor, draw
 from bayessim_jax.learning.networks import Mlp
 from bayessim_jax.learning.normalisation import Scaling
 
@@ -20,7 +20,7 @@ class NetworkPolicy:
 
     weights: Any
     scaling: Scaling
-    head: Head
+    head: Actor
     network: Mlp = struct.field(pytree_node=False)
     deterministic: bool = struct.field(pytree_node=False, default=False)
 

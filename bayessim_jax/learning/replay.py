@@ -37,6 +37,24 @@ class Replay:
             filled=jnp.minimum(self.filled + count, capacity),
         )
 
+    def sample_later(
+        self, key: PRNGKeyArray, batch: tuple[int, ...], weights: Float[Array, " episodes"]
+    ) -> tuple[Float[Array, "*batch width"], Float[Array, "*batch width"]]:
+        """Rows of episodes drawn by their weights, and for each one drawn evenly from itself and those after it.
+
+        Episodes are blocks of equal length that fill the table.
+        """
+        length = self.table.shape[0] // weights.size
+        episode_key, row_key, later_key = jax.random.split(key, 3)
+        held = jnp.where(jnp.arange(weights.size) * length < self.filled, weights, 0.0)
+        heaped = jnp.cumsum(held)
+        picks = heaped[-1] * jax.random.uniform(episode_key, (math.prod(batch),))
+        episode = jnp.clip(jnp.searchsorted(heaped, picks, side="right"), 0, weights.size - 1)
+        row = jax.random.randint(row_key, episode.shape, 0, length)
+        left = (length - row) * jax.random.uniform(later_key, row.shape)
+        now, later = (self.table[episode * length + r] for r in (row, row + left.astype(row.dtype)))
+        return now.reshape(*batch, -1), later.reshape(*batch, -1)
+
     def sample(self, key: PRNGKeyArray, batch: tuple[int, ...]) -> Float[Array, "*batch width"]:
         """Rows drawn evenly, with replacement, from those that hold data."""
         rows = jax.random.randint(key, (math.prod(batch),), 0, jnp.maximum(self.filled, 1))

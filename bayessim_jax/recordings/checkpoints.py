@@ -40,7 +40,7 @@ class Checkpoints:
         """Write the state; on return it is on disk, whole."""
         about = {"settings": settings, "shapes": _shapes(state)}
         self.manager.save(
-            rounds, args=ocp.args.Composite(state=ocp.args.StandardSave(state), about=ocp.args.JsonSave(about))
+            rounds, args=ocp.args.Composite(state=ocp.args.StandardSave(_filled(state)), about=ocp.args.JsonSave(about))
         )
         self.manager.wait_until_finished()
 
@@ -58,10 +58,11 @@ class Checkpoints:
                     f"checkpoint {self.path / str(self.latest)} holds another state: {name} is {there} there and "
                     f"{here} here; start again with another --out."
                 )
-        abstract = jax.tree.map(ocp.tree.to_shape_dtype_struct, like)
+        abstract = jax.tree.map(ocp.tree.to_shape_dtype_struct, _filled(like))
         restored = self._restore(state=ocp.args.StandardRestore(abstract))["state"]
         # tied to no device, as the arrays of a new run are: the same programs then serve both from the cache
-        return jax.tree.map(jnp.asarray, jax.device_get(restored))
+        restored = jax.device_get(restored)
+        return jax.tree.map(lambda empty, leaf: jnp.asarray(empty if leaf is None else leaf), like, restored)
 
     def _restore(self, **items: Any) -> Any:
         if self.latest is None:
@@ -77,6 +78,11 @@ class Checkpoints:
             f"checkpoint {self.path / str(self.latest)} is damaged ({reason[:160]}); "
             "delete that folder to continue from the one before, or start again with another --out."
         )
+
+
+def _filled(state: Any) -> Any:
+    """The state without its arrays of size zero, which orbax does not store."""
+    return jax.tree.map(lambda leaf: leaf if leaf.size else None, state)
 
 
 def _shapes(state: Any) -> dict[str, str]:

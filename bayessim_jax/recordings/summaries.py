@@ -67,9 +67,10 @@ def metrics_line(
 
     `log_prob_true` is in raw units of θ; `log_prob_true_scaled` is the density of θ divided by the prior's width,
     log q(θ*) + Σ log(high − low), and `gain_over_prior` is log q(θ*) − log p(θ*): for a uniform prior they are equal.
-    `truth` is θ* in that round. `simulations` counts the trajectories of all seeds that shared the `seconds` of the
-    round.
+    `truth` is θ* in that round. `simulations` counts the trajectories of all seeds that shared the `seconds` of a
+    round that infers.
     """
+    inferred = np.isfinite(info.pool_size)
     named = lambda values: dict(zip(parameters.names, np.asarray(values, float).tolist(), strict=True))  # noqa: E731
     width = float(np.log(np.asarray(parameters.width, float)).sum())
     log_prob_true = float(summary.log_prob_true)
@@ -81,9 +82,10 @@ def metrics_line(
         "gain_over_prior": log_prob_true + width,
         "return_target": float(info.return_target),
         "cost_target": float(info.cost_target),
+        "success_target": float(info.success_target),
         "return_simulated": float(np.mean(info.learning.return_mean)),
         "seconds": seconds,
-        "simulations_per_second": simulations / max(seconds, 1e-9),
+        "simulations_per_second": simulations / max(seconds, 1e-9) if inferred else 0.0,
         "diverged": int(info.diverged),
         "nonfinite": int(info.fit.nonfinite) + int(np.sum(info.learning.nonfinite)),
         "overfit": bool(info.fit.overfit),

@@ -137,6 +137,7 @@ def _rounds_table(run: OnlineRun) -> str:
         "gain_over_prior": "gain over prior",
         "return_target": "return, target",
         "cost_target": "cost of a step",
+        "success_target": "success, target",
         "return_simulated": "return, simulated",
         "log_q_validation": "held-out log q",
         "coverage90": "coverage of 90 %",

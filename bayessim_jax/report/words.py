@@ -74,9 +74,10 @@ def _several(run: OnlineRun) -> str:
 
 def worries(run: OnlineRun) -> list[str]:
     """Reasons for distrust, the worst first; empty where none was found."""
-    at = lambda name: run.series(name)[:, -1]  # noqa: E731
     several = len(run.seeds) > 1
     found = []
+    inferred = np.flatnonzero(np.isfinite(run.series("log_q_validation")).any(0))
+    at = lambda name: run.series(name)[:, inferred[-1:]]  # noqa: E731
     wanted = int(run.settings.get("rounds", run.rounds))
     if run.rounds < wanted:
         found.append(f"The run stopped after {_count(run.rounds, 'round')} of {wanted}.")
@@ -90,7 +91,7 @@ def worries(run: OnlineRun) -> list[str]:
             "while the fit was over-confident. Do not trust its width."
         )
     if (n := int(np.nansum(at("overconfident")))) > 0:
-        share = float(np.nanmin(at("coverage90")))
+        share = float(np.nanmin(at("coverage90")))  # of the last round that inferred, as everything here
         found.append(
             f"The posterior is over-confident{_in(n, several)}: only {share:.0%} of the held-out simulated sets lie "
             "inside their 90 % credible set, recalibration included."
@@ -99,7 +100,7 @@ def worries(run: OnlineRun) -> list[str]:
         found.append(
             f"The last fit over-fitted after its best epoch{_in(n, several)}; the weights of that epoch were kept."
         )
-    found += _against_truth(run, several)
+    found += _against_truth(run, several) if inferred.size else []
     if (n := int(np.nansum(run.series("diverged")))) > 0:
         found.append(f"{_count(n, 'simulation')} gave numbers that are not finite and took part in nothing.")
     if (n := int(np.nansum(run.series("nonfinite")))) > 0:

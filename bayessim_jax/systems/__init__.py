@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from bayessim_jax.spelling import find_named
@@ -11,7 +12,11 @@ from bayessim_jax.systems.acrobot import Raise as Raise
 from bayessim_jax.systems.cartpole import Balance as Balance
 from bayessim_jax.systems.cartpole import CartPole as CartPole
 from bayessim_jax.systems.cartpole import Centre as Centre
+from bayessim_jax.systems.fetch import Fetch as Fetch
+from bayessim_jax.systems.fetch import MoveTo as MoveTo
 from bayessim_jax.systems.functional import from_functions as from_functions
+from bayessim_jax.systems.hopper import Hop as Hop
+from bayessim_jax.systems.hopper import Hopper as Hopper
 from bayessim_jax.systems.pendulum import Pendulum as Pendulum
 from bayessim_jax.systems.pendulum import SwingUp as SwingUp
 from bayessim_jax.systems.pendulum import Upswing as Upswing
@@ -51,6 +56,9 @@ SYSTEMS: dict[str, Entry] = {
     "skid_steer": Entry(
         SkidSteer.create, FollowCircle, "mppi", "drive around a circle on wheels that slide sideways", FollowCircle
     ),
+    "hopper": Entry(Hopper.create, Hop, "ppo", "hop forward on one leg; the simulator is Brax, the target MuJoCo"),
+    "fetch_push": Entry(partial(Fetch.create, "push"), MoveTo, "her", "push a box to a place on a table with an arm"),
+    "fetch_slide": Entry(partial(Fetch.create, "slide"), MoveTo, "her", "hit a puck so that it slides to a place"),
 }
 
 

@@ -315,3 +315,28 @@ def test_a_planner_drives_through_the_command(tmp_path, system):
     page = (out / "report.html").read_text()
     assert "Mean cost of a step so far" in page
     assert ("Paths around the circle" in page) == ('class="wide animation"' in page) == (system == "skid_steer")
+
+
+@pytest.mark.parametrize(("scheme", "inferred"), [("offline", [False, True, False]), ("uniform", [False] * 3)])
+def test_other_schemes_infer_once_or_never(tmp_path, scheme, inferred):
+    (tmp_path / "c.toml").write_text(TINY)
+    words = ["cartpole", "--config", tmp_path / "c.toml", "--scheme", scheme, "--warmup", 1, "--out", tmp_path / "run"]
+    assert main(["online", *map(str, words), "--quiet"]) == 0
+    lines = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+    assert [line["log_q_validation"] is not None for line in lines] == inferred
+    assert [line["gain_over_prior"] != pytest.approx(0.0, abs=1e-4) for line in lines] == np.cumsum(inferred).tolist()
+    assert all(line["return_target"] > 0 for line in lines)
+    report = (tmp_path / "run" / "report.html").read_text()
+    assert "confidently wrong" not in report or scheme == "offline"
+    assert main(["online", *map(str, words), "--quiet", "--resume", "--rounds", "4"]) == 0
+
+
+def test_systems_have_habits_of_their_own(tmp_path):
+    from bayessim_jax.cli.resolution import read_command
+
+    assert read_command(["fetch_push"]).settings.warmup == 3
+    assert read_command(["fetch_push", "--warmup", "1"]).settings.warmup == 1
+    (tmp_path / "c.toml").write_text('system = "fetch_slide"\nnoise = 0.002')
+    told = read_command(["--config", str(tmp_path / "c.toml")]).settings
+    assert (told.system, told.noise, told.warmup) == ("fetch_slide", 0.002, 3)
+    assert read_command(["cartpole"]).settings == Settings("cartpole")

@@ -1,3 +1,4 @@
+import dataclasses
 import subprocess
 import sys
 import typing
@@ -32,7 +33,7 @@ def test_the_defaults_are_the_papers():
     ("words", "message"),
     [
         ("cartpol", "unknown system 'cartpol': did you mean 'cartpole'?"),
-        ("", "bayessim online needs one of cartpole, pendulum, acrobot, skid_steer after it; see bayessim"),
+        ("", "bayessim online needs one of cartpole, pendulum, acrobot, skid_steer, hopper, fetch_push, fetch_slide"),
         ("cartpole --ronds 3", "unknown flag '--ronds': did you mean '--rounds'?"),
         ("--sed=3 cartpole", "unknown flag '--sed': did you mean '--seed'?"),
         ("cartpole --prior 3", "--prior has no flag; set it in a table [prior] of a file for --config."),
@@ -129,7 +130,22 @@ def test_systems_are_listed_with_priors_and_units(capsys):
         "pendulum",
         "acrobot",
         "skid_steer",
+        "hopper",
+        "fetch_push",
+        "fetch_slide",
     ]
+
+
+def test_a_system_whose_package_is_missing_is_listed_with_the_remedy(capsys, monkeypatch):
+    from bayessim_jax.systems import SYSTEMS
+
+    def missing():
+        raise ValueError("Fetch needs gymnasium-robotics: pip install it.")
+
+    monkeypatch.setitem(SYSTEMS, "fetch_push", dataclasses.replace(SYSTEMS["fetch_push"], system=missing))
+    assert main(["systems"]) == 0
+    assert "fetch_push: push a box" in (told := capsys.readouterr().out)
+    assert "  Fetch needs gymnasium-robotics: pip install it.\n" in told
 
 
 @pytest.mark.parametrize("words", [["--help"], ["--version"], ["online", "--help"], ["online", "cartpol"]])
@@ -156,15 +172,16 @@ def test_the_choices_are_those_of_the_registries():
 
 
 def test_the_defaults_are_those_of_the_library():
-    import dataclasses
     import inspect
 
     from bayessim_jax import online
+    from bayessim_jax.cli.plan import INFERENCES
     from bayessim_jax.inference.estimators import recurrent_mixture
 
     settings = Settings("cartpole")
     for field in dataclasses.fields(online.Setup):
-        if field.default is not dataclasses.MISSING:
+        if field.name != "inferences" and field.default is not dataclasses.MISSING:
             assert getattr(settings, field.name) == field.default, field.name
+    assert INFERENCES[settings.scheme] == online.Setup.inferences
     assert settings.proposal == inspect.signature(online.Setup.create).parameters["proposal"].default
     assert settings.encoder == inspect.signature(recurrent_mixture).parameters["encoder"].default

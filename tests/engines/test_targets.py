@@ -14,6 +14,7 @@ from flax import struct
 from bayessim_jax.contracts import Target
 from bayessim_jax.engines import GymnasiumTarget, SimulatedTarget, gymnasium_target
 from bayessim_jax.engines import gymnasium as host
+from bayessim_jax.learning import RandomPolicy
 from bayessim_jax.systems import SYSTEMS
 
 
@@ -51,8 +52,8 @@ def test_targets_keep_the_contract(name):
     entry = SYSTEMS[name]
     system = entry.system()
     theta = (system.parameters.low + system.parameters.high) / 2
-    policy = Reflex(jnp.zeros(system.observations.size), name != "pendulum")
-    real = gymnasium_target(name, theta)
+    policy = RandomPolicy(system.actions)
+    real = gymnasium_target(name, theta, system.noise)
     stand_in = SimulatedTarget(system, entry.task(), theta)
     assert isinstance(real, Target)
     assert isinstance(stand_in, Target)

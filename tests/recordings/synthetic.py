@@ -75,6 +75,7 @@ def one_info(system, index, truth, steps=5, recordings=2, **flags):
         learning=Learning(return_mean=jnp.array(10.0 * index), nonfinite=jnp.array(0)),
         return_target=jnp.array(20.0 * index),
         cost_target=jnp.array(0.1 * index),
+        success_target=jnp.array(0.1 * index),
         diverged=jnp.array(0),
         pool_size=jnp.array(100.0),
         uninformed=flag("uninformed"),

@@ -128,6 +128,17 @@ def test_only_the_last_two_checkpoints_are_kept(whole):
     assert kept == {"3", "4"}
 
 
+def test_empty_arrays_of_a_state_come_back(tmp_path):
+    """A posterior of one parameter has nothing below the diagonal."""
+    state = {"below": jnp.zeros((5, 0)), "weights": [jnp.arange(3.0)]}
+    checkpoints = Checkpoints(tmp_path / "checkpoints")
+    checkpoints.save(1, state, {})
+    back = checkpoints.restore(state)
+    checkpoints.close()
+    assert back["below"].shape == (5, 0)
+    np.testing.assert_array_equal(back["weights"][0], state["weights"][0])
+
+
 def test_a_checkpoint_knows_its_settings(whole):
     checkpoints = Checkpoints(whole.path / "checkpoints")
     assert checkpoints.settings() == SETTINGS

@@ -34,7 +34,7 @@ def gymnasium_run(name, seed):
     return theta, *(np.array(x) for x in (states, actions, rewards, ends))
 
 
-@pytest.fixture(scope="module", params=sorted(GYMNASIUM))
+@pytest.fixture(scope="module", params=["acrobot", "cartpole", "pendulum"])
 def runs(request):
     columns = zip(*(gymnasium_run(request.param, seed) for seed in range(THETAS)), strict=True)
     return request.param, [np.stack(c) for c in columns]

@@ -1,0 +1,172 @@
+"""Hopper on Brax's physics: a leg in the plane, the model and the task of Gymnasium's `Hopper-v5`.
+
+The model file is read where Brax is installed: `pip install 'bayessim-jax[brax]'`.
+
+Source: Freeman et al. 2021; Erez, Tassa and Todorov 2011
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import io
+import warnings
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from bayessim_jax.contracts import Box, Discrete, Scalar
+
+__all__ = ["PIPELINES", "Hop", "Hopper", "HopperState"]
+
+PIPELINES = ("generalized", "positional", "spring")
+SUBSTEPS = 4
+SCATTER = 5e-3
+"""Episodes begin with every position and velocity moved by up to this, m and rad, and per s."""
+
+
+@struct.dataclass
+class HopperState:
+    """Brax's state: `physics.q` and `physics.qd` are x and z of the torso, its pitch, three angles, and their rates."""
+
+    physics: Any
+
+
+@struct.dataclass
+class Hopper:
+    """Torso, thigh, leg and foot with motors at three hinges, on a floor of sliding friction θ.
+
+    MuJoCo takes the larger friction of two geoms that touch, and so does Brax: θ is that of foot and floor. What is
+    seen is what the environment shows: height and pitch of the torso, three angles, and the rates of all, clipped to
+    ±10, with the speed along x as the first rate. `pipeline` says which of Brax's ways to step steps it.
+
+    Source: Freeman et al. 2021
+    """
+
+    parameters: Box
+    actions: Box | Discrete
+    observations: Box
+    noise: Float[Array, " obs"]
+    dt: float = struct.field(pytree_node=False)
+    pipeline: str = struct.field(pytree_node=False)
+
+    @classmethod
+    def create(
+        cls, friction: tuple[float, float] = (0.1, 0.5), noise: float = 0.01, pipeline: str = "generalized"
+    ) -> Hopper:
+        """The paper's prior range, and sensor noise of the given standard deviation on every channel."""
+        if pipeline not in PIPELINES:
+            raise ValueError(f"pipeline {pipeline!r}: choose one of {', '.join(PIPELINES)}.")
+        hinges, angle = ("thigh", "leg", "foot"), (-2.7, 0.1, "rad")
+        return cls(
+            parameters=Box.create(friction=(*friction, "")),
+            actions=Box.create(**dict.fromkeys(hinges, (-1.0, 1.0, ""))),
+            observations=Box.create(
+                z=(0.7, 1.7, "m"),
+                pitch=(-0.2, 0.2, "rad"),
+                thigh=angle,
+                leg=angle,
+                foot=(-0.8, 0.8, "rad"),
+                x_rate=(-3.0, 5.0, "m/s"),
+                z_rate=(-4.0, 4.0, "m/s"),
+                **{f"{name}_rate": (-10.0, 10.0, "rad/s") for name in ("pitch", *hinges)},
+            ),
+            noise=jnp.full(11, noise),
+            dt=SUBSTEPS * float(_load().opt.timestep),
+            pipeline=pipeline,
+        )
+
+    def reset(self, key: PRNGKeyArray, theta: Float[Array, " d"]) -> HopperState:
+        """Upright, every coordinate moved by up to 0.005."""
+        move = SCATTER * jax.random.uniform(key, (12,), minval=-1.0, maxval=1.0)
+        return self.begin(theta, move[:6].at[1].add(_load_rise()), move[6:])
+
+    def begin(self, theta: Float[Array, " d"], qpos: Float[Array, "6"], qvel: Float[Array, "6"]) -> HopperState:
+        """The state with these coordinates: x and z of the torso, its pitch, three angles, and their rates."""
+        rise = jnp.zeros(6).at[1].set(_load_rise())
+        with _quiet():
+            return HopperState(_pipeline(self.pipeline).init(_with(theta), qpos - rise, qvel))
+
+    def step(self, theta: Float[Array, " d"], state: HopperState, action: Float[Array, " act"]) -> HopperState:
+        """Advance by one control period of four time steps."""
+        model, pipeline = _with(theta), _pipeline(self.pipeline)
+        held = jnp.clip(action, -1.0, 1.0)
+        step = lambda physics, _: (pipeline.step(model, physics, held), None)  # noqa: E731
+        with _quiet():
+            return HopperState(jax.lax.scan(step, state.physics, None, length=SUBSTEPS)[0])
+
+    def observe(self, theta: Float[Array, " d"], state: HopperState) -> Float[Array, " obs"]:
+        """Everything but the way along x."""
+        return jnp.concatenate([_coordinates(state)[1:], jnp.clip(state.physics.qd, -10.0, 10.0)])
+
+
+@struct.dataclass
+class Hop:
+    """Hop forward: speed along x, +1 for every step on which it is upright, −0.001 |u|²; ends where it falls.
+
+    Upright: the torso higher than 0.7 m and pitched by less than 0.2 rad, everything else within ±100.
+
+    Source: Erez, Tassa and Todorov 2011
+    """
+
+    steps: int = struct.field(pytree_node=False, default=1000)
+
+    def reward(self, state: HopperState, action: Float[Array, " act"], next_state: HopperState) -> Scalar:
+        """What Gymnasium's environment pays."""
+        speed = (next_state.physics.q[0] - state.physics.q[0]) / (SUBSTEPS * float(_load().opt.timestep))
+        return speed + ~self.terminated(next_state) - 1e-3 * jnp.sum(action**2)
+
+    def terminated(self, state: HopperState) -> Bool[Array, ""]:
+        """Fallen."""
+        place = _coordinates(state)
+        rest = jnp.concatenate([place[2:], state.physics.qd])
+        return ~((place[1] > 0.7) & (jnp.abs(place[2]) < 0.2) & (jnp.abs(rest) < 100.0).all())
+
+
+def _coordinates(state: HopperState) -> Any:
+    """Brax counts the height from where the torso stands upright."""
+    return state.physics.q.at[1].add(_load_rise())
+
+
+@cache
+def _load() -> Any:
+    """The model of Brax's own Hopper; `ValueError` in one line where Brax is not installed."""
+    found = importlib.util.find_spec("brax")
+    if found is None or found.origin is None:
+        raise ValueError("Hopper needs Brax: pip install 'bayessim-jax[brax]' and try again.")
+    with _quiet(), jax.ensure_compile_time_eval():
+        mjcf: Any = importlib.import_module("brax.io.mjcf")
+        return mjcf.load(str(Path(found.origin).parent / "envs" / "assets" / "hopper.xml"))
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Brax tells what it lacks and what is no longer maintained, when it is imported and when it is traced."""
+    heard = io.StringIO()
+    with contextlib.redirect_stdout(heard), contextlib.redirect_stderr(heard), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def _load_rise() -> float:
+    """Height of the torso at rest, m."""
+    return float(_load().mj_model.body("torso").pos[2])
+
+
+@cache
+def _pipeline(name: str) -> Any:
+    with _quiet():
+        return importlib.import_module(f"brax.{name}.pipeline")
+
+
+def _with(theta: Any) -> Any:
+    """The model with a friction on every geom."""
+    model = _load()
+    return model.replace(geom_friction=jnp.asarray(model.geom_friction).at[:, 0].set(theta[0]))

@@ -1,0 +1,85 @@
+"""Brax's hopper is MuJoCo's but for what its contacts make of a step."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bayessim_jax.engines.gymnasium import GYMNASIUM
+from bayessim_jax.systems import Hop, Hopper, hopper
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
+from hopper_gap import compare, record
+
+
+def test_in_the_air_one_step_is_gymnasiums():
+    """Without contact only the integrators differ: semi-implicit Euler here, Runge-Kutta there."""
+    env_id, configure, _ = GYMNASIUM["hopper"]
+    env = gymnasium.make(env_id, disable_env_checker=True).unwrapped
+    system, task, rng = Hopper.create(noise=0.0), Hop(), np.random.default_rng(0)
+
+    @jax.jit
+    def step(theta, qpos, qvel, action):
+        state = system.begin(theta, qpos, qvel)
+        after = system.step(theta, state, action)
+        return system.observe(theta, state), system.observe(theta, after), task.reward(state, action, after)
+
+    for _ in range(10):
+        theta, action = rng.uniform(0.1, 0.5, 1), rng.uniform(-1, 1, 3)
+        configure(env, theta)
+        env.reset(seed=0)
+        # arms of the chain off their stops, well above the floor
+        qpos = np.array([rng.normal(), 2.5, *rng.uniform(-0.1, 0.1, 1), *rng.uniform(-1.0, -0.2, 2), 0.1])
+        env.set_state(qpos, rng.uniform(-1, 1, 6))
+        floats = (jnp.asarray(x, float) for x in (theta, env.data.qpos, env.data.qvel, action))
+        before, later, reward = step(*floats)
+        np.testing.assert_allclose(before, env._get_obs(), atol=1e-6)
+        theirs, paid, *_ = env.step(action)
+        np.testing.assert_allclose(later[:5], theirs[:5], atol=2e-3)
+        np.testing.assert_allclose(later[5:], theirs[5:], atol=0.05)
+        assert float(reward) == pytest.approx(paid, abs=0.05)
+
+
+def test_the_gap_between_the_engines_is_as_stated():
+    gaps, rewards, same_end = compare(Hopper.create(noise=0.0), *record(20, 5, 0))
+    assert np.median(gaps[:, 0, :5], 0).max() < 3e-3
+    assert np.median(gaps[:, 0, 5:], 0).max() < 3e-2
+    assert np.median(rewards) < 0.03
+    assert same_end.mean() > 0.9
+
+
+def test_friction_stops_a_sliding_foot():
+    system = Hopper.create(noise=0.0)
+    qvel = jnp.zeros(6).at[0].set(1.0)
+
+    def speed(friction):
+        theta = friction[None]
+        state = system.begin(theta, jnp.zeros(6).at[1].set(1.25), qvel)
+        step = lambda state, _: (system.step(theta, state, jnp.zeros(3)), None)  # noqa: E731
+        return jax.lax.scan(step, state, None, length=12)[0].physics.xd.vel[3, 0]
+
+    slow = jax.jit(jax.vmap(speed))(jnp.array([0.1, 0.3, 0.5]))
+    assert (np.diff(slow) < -1e-3).all()
+
+
+def test_falling_ends_the_task():
+    system, task, theta = Hopper.create(), Hop(), jnp.array([0.3])
+    stands = jax.jit(lambda qpos: task.terminated(system.begin(theta, qpos, jnp.zeros(6))))
+    upright = jnp.zeros(6).at[1].set(1.25)
+    assert not stands(upright)
+    assert stands(upright.at[1].set(0.69))
+    assert stands(upright.at[2].set(-0.21))
+
+
+def test_without_brax_one_line_tells(monkeypatch):
+    hopper._load.cache_clear()
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"pip install 'bayessim-jax\[brax\]'"):
+        Hopper.create()
+    with pytest.raises(ValueError, match="choose one of generalized, positional, spring"):
+        Hopper.create(pipeline="planar")
