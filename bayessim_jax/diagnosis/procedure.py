@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -16,35 +16,14 @@ from bayessim_jax.beliefs.margins import Margins
 from bayessim_jax.diagnosis.bench import SLOTS, Bench, Candidate
 from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.diagnosis.screen import Screen, Screened
-from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, Misfit, judge_misfit
+from bayessim_jax.diagnosis.verdict import Diagnosis, Entry, Thresholds, are_kin, decide, share_left
+from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, judge_misfit
 from bayessim_jax.effects import Scales
 from bayessim_jax.inference.direct import noise_floor
 from bayessim_jax.inference.shooting import Fit, Shots
 from bayessim_jax.systems.mjcf import MjcfSystem
 
-__all__ = [
-    "CONTAINS",
-    "Diagnosis",
-    "Entry",
-    "Problem",
-    "Thresholds",
-    "detect",
-    "is_mismatch",
-    "name_effects",
-    "share_left",
-]
-
-CONTAINS = {
-    "stribeck_friction": ("coulomb_friction",),
-    "asymmetric_friction": ("coulomb_friction",),
-    "load_dependent_friction": ("coulomb_friction",),
-    "lugre_friction": ("coulomb_friction", "stribeck_friction"),
-    "gain_drop": ("actuator_gain",),
-    "gain_drift": ("actuator_gain",),
-    "payload": ("link_offset",),
-}
-"""Effects that have others as special cases: where both do as well, the simpler one is the finding."""
-
+__all__ = ["Problem", "detect", "is_mismatch", "name_effects"]
 
 SCREENED = 60
 """Windows with which every candidate is tried at first."""
@@ -58,57 +37,6 @@ DOUBT = 0.05
 """Probability that a model fails in a window, where the simulator without effects then predicts."""
 FOLDS = 4
 """Groups of recordings, each scored by fits to the others."""
-
-
-@dataclass(frozen=True)
-class Thresholds:
-    """What decides."""
-
-    negligible: float = 0.02
-    """Power of a misfit over that of the noise, below which it is none."""
-    left: float = 0.05
-    """Share of the baseline's misfit that an explanation may leave."""
-    tie: float = 2.0
-    """Standard errors within which two candidates predict held-out windows alike."""
-    least: float = 4.0
-    """Nats in all by which a candidate has to be worse to be out of the confusion set."""
-
-
-@dataclass
-class Entry:
-    """A candidate, fitted to all windows that choose, and scored on windows that its fit did not see."""
-
-    candidate: Candidate
-    names: list[str]
-    fit: Fit
-    scores: Float[np.ndarray, " windows"]
-    """Log predictive density of every window, its initial state profiled out."""
-    misfit: Misfit
-
-    @property
-    def score(self) -> float:
-        """Sum over windows."""
-        return float(self.scores.sum())
-
-
-@dataclass
-class Diagnosis:
-    """What was found."""
-
-    verdict: str
-    bench: Bench
-    """On which the candidates that came to the end were fitted."""
-    baseline: Entry
-    entries: list[Entry]
-    """Candidates that came to the end, best first."""
-    confusion: list[Entry] = field(default_factory=list)
-    screened: list[tuple[str, float]] = field(default_factory=list)
-    """Every candidate and how much it gained on the windows it was fitted to."""
-
-    @property
-    def best(self) -> Entry:
-        """What the verdict names, or the best there was."""
-        return self.confusion[0] if self.confusion else self.entries[0] if self.entries else self.baseline
 
 
 @dataclass
@@ -226,11 +154,11 @@ def name_effects(
     ranked = _rank(screen, nothing, random, say)
     if not ranked:
         return Diagnosis("unexplained", *detect(key, problem, _still(problem, start)), [])
-    singles = _finalists(problem, nothing, ranked)
+    singles = _finalists(screen, nothing, ranked)
     work = _bench_of(key, problem, singles, say)
     none = _without(work, problem, detected)
     entries = _finish(work, none, singles)
-    if not entries or share_left(entries[0].misfit, none.misfit) > thresholds.left:
+    if not entries or share_left(entries[0].misfit, none.misfit) > thresholds.enough:
         say("one effect is not enough: trying pairs")
         pairs = _pair(screen, ranked, random)[:PAIRS]
         alone = {k for pair in pairs for k in pair.candidate.effects}
@@ -240,7 +168,7 @@ def name_effects(
         none = _without(work, problem, detected)
         entries = _finish(work, none, kept)
     listed = [(screen.name(found.candidate), found.score - nothing.score) for found in ranked]
-    return _decide(work, none, entries, listed, thresholds)
+    return decide(work.bench, none, entries, work.group, thresholds, listed)
 
 
 def _quiet(text: str) -> None:
@@ -253,13 +181,6 @@ def _bench_of(key: PRNGKeyArray, problem: Problem, candidates: Sequence[Screened
     bench = problem.bench([problem.pairs[k] for k in numbers])
     say(f"simulating {len(candidates)} candidates; compiling takes a while")
     return _Work(key, bench, problem.group, noise_floor(bench.shots), say, tuple(numbers))
-
-
-def _are_kin(problem: Problem, one: int, other: int) -> bool:
-    """Whether of two pairs at one place the one has the other as a special case."""
-    (effect, place), (relative, where) = problem.pairs[one], problem.pairs[other]
-    kin = effect.name in CONTAINS.get(relative.name, ()) or relative.name in CONTAINS.get(effect.name, ())
-    return kin and place == where
 
 
 def _rank(screen: Screen, nothing: Screened, random: np.random.Generator, say: Callable[[str], None]) -> list[Screened]:
@@ -275,16 +196,19 @@ def _rank(screen: Screen, nothing: Screened, random: np.random.Generator, say: C
     return sorted(found, key=lambda item: -item.score)
 
 
-def _finalists(problem: Problem, nothing: Screened, ranked: Sequence[Screened]) -> list[Screened]:
+def _finalists(screen: Screen, nothing: Screened, ranked: Sequence[Screened]) -> list[Screened]:
     """The best single effects, those that come near them, and relatives of the first."""
     best = ranked[0].score - nothing.score
-    first = ranked[0].candidate.effects[0]
+
+    def name(found: Screened) -> str:
+        return screen.name(found.candidate)
+
     return [
         found
         for i, found in enumerate(ranked)
         if i < LEADERS
         or (i < FINALISTS and found.score - nothing.score > WORTH * best)
-        or _are_kin(problem, found.candidate.effects[0], first)
+        or are_kin(name(found), name(ranked[0]))
     ]
 
 
@@ -362,60 +286,3 @@ def _enter(
     residual, slopes = bench.look(candidate, fit, work.mask())
     misfit = judge_misfit(misfit_key, np.asarray(residual), slopes, measured, known)
     return Entry(candidate, bench.names(candidate), fit, scores, misfit)
-
-
-def share_left(after: Misfit, before: Misfit) -> float:
-    """Share of a misfit that a candidate leaves, both in units of the smaller noise."""
-    noise = np.minimum(after.noise, before.noise)
-    own, was = ((m.excess * (m.noise / noise) ** 2).sum() for m in (after, before))
-    return float(max(own, 0.0) / max(was, 1e-12))
-
-
-def _decide(
-    work: _Work, none: Entry, entries: list[Entry], screened: list[tuple[str, float]], thresholds: Thresholds
-) -> Diagnosis:
-    """One of four verdicts."""
-    result = Diagnosis("unexplained", work.bench, none, entries, [], screened)
-    if not entries:
-        return result
-    best = entries[0]
-    if best.score - none.score < thresholds.least:
-        return result
-    tied = [entry for entry in entries if _ties(entry, best, thresholds)]
-    fewest = min(len(entry.candidate.effects) for entry in tied)
-    tied = [entry for entry in tied if len(entry.candidate.effects) == fewest]
-    tied = [entry for entry in tied if not _contains_another(entry, tied)]
-    explaining = [
-        e for e in tied if share_left(e.misfit, none.misfit) <= thresholds.left or e.misfit.p_value >= FALSE_ALARMS
-    ]
-    if not explaining:
-        return result
-    result.confusion = sorted(explaining, key=lambda e: (len(work.bench.columns(e.candidate)), -e.score))
-    result.verdict = "explained" if len(result.confusion) == 1 else "ambiguous"
-    return result
-
-
-def _ties(entry: Entry, best: Entry, thresholds: Thresholds) -> bool:
-    """Whether a candidate predicts held-out windows as well as the best one, within the error of the difference."""
-    difference = best.scores - entry.scores
-    error = difference.std(ddof=1) * np.sqrt(len(difference)) if len(difference) > 1 else 0.0
-    return float(difference.sum()) <= max(thresholds.tie * error, thresholds.least)
-
-
-def _contains_another(entry: Entry, tied: Sequence[Entry]) -> bool:
-    """Whether another candidate among the ties is this one with an effect replaced by a special case of it."""
-
-    def split(name: str) -> tuple[str, str]:
-        effect, _, place = name.partition("@")
-        return effect, place
-
-    for other in tied:
-        if other is entry or len(other.names) != len(entry.names):
-            continue
-        mine, theirs = set(entry.names) - set(other.names), set(other.names) - set(entry.names)
-        if len(mine) != 1 or len(theirs) != 1:
-            continue
-        (effect, place), (simpler, where) = split(mine.pop()), split(theirs.pop())
-        if simpler in CONTAINS.get(effect, ()) and place == where:
-            return True
-    return False

@@ -15,18 +15,10 @@ from jaxtyping import Array, Bool, Float
 from bayessim_jax.diagnosis.bench import Bench, Candidate
 from bayessim_jax.diagnosis.flexible import FEATURES, FlexibleForce, features
 from bayessim_jax.diagnosis.locate import Location, find_regime, find_windows_of, shares_from_left
-from bayessim_jax.diagnosis.procedure import (
-    Diagnosis,
-    Entry,
-    Problem,
-    Thresholds,
-    detect,
-    is_mismatch,
-    name_effects,
-    share_left,
-)
+from bayessim_jax.diagnosis.procedure import Problem, detect, is_mismatch, name_effects
 from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.diagnosis.screen import Screened
+from bayessim_jax.diagnosis.verdict import Diagnosis, Entry, Thresholds, share_left
 from bayessim_jax.effects import EFFECTS, Scales, effect_places, recorded_scales
 from bayessim_jax.inference.scores import Score, compare, error_spread, score
 from bayessim_jax.inference.shooting import Shots
@@ -70,7 +62,6 @@ class CaseDiagnosis:
     noise_floor: float
     theta: dict[str, tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]]
     """Mean and standard deviation of the parameters, `baseline` and `augmented`."""
-    probabilities: list[float]
     next_experiment: str
 
     @property
@@ -144,7 +135,7 @@ class CaseDiagnosis:
                 {
                     "effect": effect,
                     "at": place,
-                    "probability": self.probabilities[0],
+                    "probability": self.result.probabilities[0],
                     "parameters": {
                         short: {"mean": means[key], "sd": sds[key], "unit": units[key]} for key, short in own.items()
                     },
@@ -306,7 +297,6 @@ def diagnose_case(
         scale=scale,
         noise_floor=_floor(bench, result.best, scale, model, shots),
         theta={which: _theta(bench, entry) for which, entry in entries.items()},
-        probabilities=_probabilities(result),
         next_experiment=_advice(result),
     )
 
@@ -432,19 +422,6 @@ def _joint_of(model: CaseModel, place: str) -> str:
     if kind == "joint":
         return f"joint/{rest.removesuffix('/qpos').removesuffix('/qvel')}"
     return place
-
-
-def _probabilities(result: Diagnosis) -> list[float]:
-    """Of the sets in the confusion set: weights by held-out score, tempered by the error of the differences."""
-    if not result.confusion:
-        return []
-    best = max(result.confusion, key=lambda e: e.score)
-    weights = []
-    for entry in result.entries:
-        if entry in result.confusion or entry.names == best.names:
-            weights.append(1.0)
-    count = max(len(weights), 1)
-    return [0.95 if count == 1 else 0.95 / count] * count
 
 
 HINTS = {

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_jax.diagnosis.procedure import share_left
+from bayessim_jax.diagnosis.verdict import share_left
 from bayessim_jax.recordings.diagnosing import CaseDiagnosis
 from bayessim_jax.report import html
 from bayessim_jax.report.misfit import candidates_plot, misfit_map

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayessim_jax.diagnosis.bench import Candidate
-from bayessim_jax.diagnosis.procedure import Entry, Problem, Thresholds, _contains_another, _ties
+from bayessim_jax.diagnosis.procedure import Problem
 from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.effects import EFFECTS, Scales
 from bayessim_jax.inference.replay import replay_window
@@ -95,26 +95,6 @@ def test_the_concealed_effect_lowers_the_cost_most(problem):
         costs.append(min(float(fit.cost) for fit in fits))
     assert int(np.argmin(costs)) in (0, 1)
     assert costs[0] < 0.2 * min(costs[2:])
-
-
-def entry(names, scores):
-    return Entry(Candidate(), names, None, np.asarray(scores, float), None, np.ones((1, 1)))
-
-
-def test_a_special_case_wins_over_what_contains_it():
-    coulomb, stribeck = entry(["coulomb_friction@joint/a"], [0.0]), entry(["stribeck_friction@joint/a"], [0.0])
-    elsewhere = entry(["coulomb_friction@joint/b"], [0.0])
-    assert _contains_another(stribeck, [coulomb, stribeck])
-    assert not _contains_another(coulomb, [coulomb, stribeck])
-    assert not _contains_another(stribeck, [elsewhere, stribeck])
-
-
-def test_ties_are_within_the_error_of_the_difference():
-    rng = np.random.default_rng(0)
-    best = entry(["a@x"], rng.normal(100, 1, 30))
-    same, worse = entry(["b@x"], rng.normal(100, 1, 30)), entry(["c@x"], best.scores - 20)
-    assert _ties(same, best, Thresholds())
-    assert not _ties(worse, best, Thresholds())
 
 
 def test_the_concealed_effect_comes_out_first_along_the_motion(problem):

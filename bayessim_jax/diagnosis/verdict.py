@@ -1,0 +1,195 @@
+"""From candidates and their scores to one of four verdicts, the sets that tie, and how probable each is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from bayessim_jax.diagnosis.bench import Bench, Candidate
+from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, Misfit
+from bayessim_jax.inference.shooting import Fit
+
+__all__ = ["CONTAINS", "Diagnosis", "Entry", "Thresholds", "are_kin", "decide", "share_left"]
+
+CONTAINS = {
+    "stribeck_friction": ("coulomb_friction",),
+    "asymmetric_friction": ("coulomb_friction",),
+    "load_dependent_friction": ("coulomb_friction",),
+    "lugre_friction": ("coulomb_friction", "stribeck_friction"),
+    "gain_drop": ("actuator_gain",),
+    "gain_drift": ("actuator_gain",),
+    "payload": ("link_offset",),
+}
+"""Effects that have others as special cases: where both do as well, the simpler one is the finding."""
+MIMICRY = 0.05
+"""Chance that what looks like an effect is something else that is in no library."""
+BOOTSTRAPS, FEW = 1000, 6
+"""Draws of the bootstrap; recordings, below which windows are drawn instead."""
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """What decides."""
+
+    negligible: float = 0.02
+    """Power of a misfit over that of the noise, below which it is none."""
+    left: float = 0.05
+    """Share of the baseline's misfit that an explanation may leave."""
+    enough: float = 0.015
+    """Share that a single effect may leave before pairs are tried."""
+    worth: float = 0.4
+    """Share of what fewer effects leave, below which more effects are worth it."""
+    tie: float = 2.0
+    """Standard errors within which two candidates predict held-out windows alike."""
+    least: float = 4.0
+    """Nats in all by which a candidate has to be worse to be out of the confusion set."""
+
+
+@dataclass(eq=False)
+class Entry:
+    """A candidate, fitted to all windows that choose, and scored on windows that its fit did not see."""
+
+    candidate: Candidate
+    names: list[str]
+    fit: Fit
+    scores: Float[np.ndarray, " windows"]
+    """Log predictive density of every window, its initial state profiled out."""
+    misfit: Misfit
+
+    @property
+    def score(self) -> float:
+        """Sum over windows."""
+        return float(self.scores.sum())
+
+
+@dataclass
+class Diagnosis:
+    """What was found."""
+
+    verdict: str
+    bench: Bench
+    """On which the candidates that came to the end were fitted."""
+    baseline: Entry
+    entries: list[Entry]
+    """Candidates that came to the end, best first."""
+    confusion: list[Entry] = field(default_factory=list)
+    probabilities: list[float] = field(default_factory=list)
+    """Of every set in the confusion set."""
+    screened: list[tuple[str, float]] = field(default_factory=list)
+    """Every candidate and how much it gained on the windows it was fitted to."""
+
+    @property
+    def best(self) -> Entry:
+        """What the verdict names, or the best there was."""
+        return self.confusion[0] if self.confusion else self.entries[0] if self.entries else self.baseline
+
+
+def share_left(after: Misfit, before: Misfit) -> float:
+    """Share of a misfit that a candidate leaves, both in units of the smaller noise."""
+    noise = np.minimum(after.noise, before.noise)
+    own, was = ((m.excess * (m.noise / noise) ** 2).sum() for m in (after, before))
+    return float(max(own, 0.0) / max(was, 1e-12))
+
+
+def are_kin(one: str, other: str) -> bool:
+    """Whether of two names at one place, `stribeck_friction@joint/hinge`, one has the other as a special case."""
+    return _contains(one, other) or _contains(other, one)
+
+
+def decide(
+    bench: Bench,
+    none: Entry,
+    entries: list[Entry],
+    group: Int[np.ndarray, " windows"],
+    thresholds: Thresholds,
+    screened: list[tuple[str, float]],
+) -> Diagnosis:
+    """One of four verdicts on a simulator whose misfit was detected; `entries` come best first.
+
+    The confusion set is what explains the misfit and predicts held-out windows as well as the best candidate; of these
+    the ones with the fewest effects, and of effects that contain one another the special case.
+    """
+    result = Diagnosis("unexplained", bench, none, entries, screened=screened)
+    if not entries or entries[0].score - none.score < thresholds.least:
+        return result
+    tied = [entry for entry in entries if _ties(entry, entries[0], thresholds)]
+    # what more effects explain has to be worth them: another law of the same effect leaves a rest, too
+    tied += [entry for entry in entries if entry not in tied and _suffices(entry, tied, none, thresholds)]
+    tied = [entry for entry in tied if _explains(entry, none, thresholds)]
+    if not tied:
+        return result
+    fewest = min(len(entry.candidate.effects) for entry in tied)
+    least = [entry for entry in tied if len(entry.candidate.effects) == fewest]
+    sets = [entry for entry in least if not any(_has_special_case(entry, other) for other in least)]
+    result.confusion = sorted(sets, key=lambda e: (len(bench.columns(e.candidate)), -e.score))
+    result.probabilities = _weigh(result, group)
+    result.verdict = "explained" if len(sets) == 1 else "ambiguous"
+    return result
+
+
+def _explains(entry: Entry, none: Entry, thresholds: Thresholds) -> bool:
+    return share_left(entry.misfit, none.misfit) <= thresholds.left or entry.misfit.p_value >= FALSE_ALARMS
+
+
+def _suffices(entry: Entry, tied: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:
+    """Whether a candidate explains the misfit, and those that tie for the best add effects to it without much gain."""
+    if not _explains(entry, none, thresholds):
+        return False
+    left = share_left(entry.misfit, none.misfit)
+    return all(
+        set(entry.names) < set(other.names) and share_left(other.misfit, none.misfit) > thresholds.worth * left
+        for other in tied
+    )
+
+
+def _ties(entry: Entry, best: Entry, thresholds: Thresholds) -> bool:
+    """Whether a candidate predicts held-out windows as well as the best one, within the error of the difference."""
+    difference = best.scores - entry.scores
+    error = difference.std(ddof=1) * np.sqrt(len(difference)) if len(difference) > 1 else 0.0
+    return float(difference.sum()) <= max(thresholds.tie * error, thresholds.least)
+
+
+def _contains(one: str, other: str) -> bool:
+    """Whether the first effect has the second, at the same place, as a special case."""
+    (effect, _, place), (simpler, _, where) = one.partition("@"), other.partition("@")
+    return place == where and simpler in CONTAINS.get(effect, ())
+
+
+def _has_special_case(entry: Entry, other: Entry) -> bool:
+    """Whether another candidate is this one with one effect replaced by a special case of it."""
+    mine, theirs = set(entry.names) - set(other.names), set(other.names) - set(entry.names)
+    return len(mine) == len(theirs) == 1 and _contains(mine.pop(), theirs.pop())
+
+
+def _weigh(result: Diagnosis, group: Int[np.ndarray, " windows"]) -> list[float]:
+    """How probable every set of the confusion set is.
+
+    Weights of all candidates by their held-out scores under the Bayesian bootstrap of the recordings, or of windows
+    where these are few; what a set left out as needlessly complex has goes to the sets that stand for it. Of that, the
+    share of the misfit that a set explains, and the chance that nothing outside the library looks like it.
+
+    Source: Yao et al. 2018, section 3.4 (pseudo-BMA+)
+    """
+    units = group if len(set(group.tolist())) >= FEW else np.arange(len(group))
+    labels = sorted(set(units.tolist()))
+    sums = np.array([[entry.scores[units == label].sum() for label in labels] for entry in result.entries])
+    draws = np.random.default_rng(0).dirichlet(np.ones(len(labels)), BOOTSTRAPS) * len(labels)
+    z = draws @ sums.T
+    weights = np.exp(z - z.max(1, keepdims=True))
+    weights = (weights / weights.sum(1, keepdims=True)).mean(0)
+    index = {id(entry): k for k, entry in enumerate(result.entries)}
+    own = np.array([weights[index[id(entry)]] for entry in result.confusion])
+    for entry, weight in zip(result.entries, weights, strict=True):
+        if not any(entry is chosen for chosen in result.confusion):
+            stands = np.array([_stands_for(chosen, entry) for chosen in result.confusion], float)
+            own = own + (weight * stands / stands.sum() if stands.any() else 0.0)
+    explained = [1.0 - share_left(entry.misfit, result.baseline.misfit) for entry in result.confusion]
+    return [float((1.0 - MIMICRY) * w * part) for w, part in zip(own, explained, strict=True)]
+
+
+def _stands_for(chosen: Entry, other: Entry) -> bool:
+    """Whether a set is a part of another, or the other with an effect replaced by its special case."""
+    return set(chosen.names) < set(other.names) or _has_special_case(other, chosen)

@@ -1,0 +1,81 @@
+import numpy as np
+import pytest
+
+from bayessim_jax.diagnosis.bench import Candidate
+from bayessim_jax.diagnosis.verdict import Entry, Thresholds, are_kin, decide
+from bayessim_jax.diagnosis.whiteness import Misfit
+
+WINDOWS = 30
+
+
+class OneParameterEach:
+    def columns(self, candidate):
+        return list(candidate.effects)
+
+
+def entry(names, mean, left, p=0.001, spread=1.0, seed=0):
+    scores = mean + spread * np.random.default_rng(seed).normal(size=WINDOWS)
+    misfit = Misfit(p, np.full((WINDOWS, 1), left), np.ones(1))
+    return Entry(Candidate(tuple(range(len(names)))), names, None, scores, misfit)
+
+
+def verdict(*entries, none=None):
+    none = none or entry([], 0.0, 1.0)
+    ranked = sorted(entries, key=lambda e: -e.score)
+    return decide(OneParameterEach(), none, ranked, np.arange(WINDOWS), Thresholds(), [])
+
+
+def test_one_candidate_that_explains_is_named():
+    found = verdict(entry(["a@x"], 100.0, 0.002), entry(["b@x"], 50.0, 0.4, seed=1))
+    assert found.verdict == "explained"
+    assert found.best.names == ["a@x"]
+    assert 0.9 < found.probabilities[0] < 1.0
+
+
+def test_candidates_that_predict_alike_are_a_confusion_set():
+    found = verdict(entry(["a@x"], 100.0, 0.002), entry(["b@x"], 100.0, 0.002, seed=1))
+    assert found.verdict == "ambiguous"
+    assert {tuple(e.names) for e in found.confusion} == {("a@x",), ("b@x",)}
+    assert sum(found.probabilities) < 1.0
+    assert min(found.probabilities) > 0.01
+
+
+def test_what_leaves_the_misfit_explains_nothing():
+    assert verdict(entry(["a@x"], 100.0, 0.2)).verdict == "unexplained"
+    assert verdict(entry(["a@x"], 100.0, 0.2, p=0.4)).verdict == "explained"
+    assert verdict(entry(["a@x"], 0.0, 0.0)).verdict == "unexplained"
+    assert verdict().verdict == "unexplained"
+
+
+def test_a_tie_with_what_does_not_explain_is_no_confusion():
+    assert verdict(entry(["a@x"], 100.0, 0.002), entry(["b@x"], 100.0, 0.3, seed=1)).verdict == "explained"
+
+
+def test_a_special_case_stands_for_what_contains_it():
+    coulomb, stribeck = entry(["coulomb_friction@joint/a"], 100.0, 0.0), entry(["stribeck_friction@joint/a"], 100, 0.0)
+    found = verdict(coulomb, stribeck)
+    assert [e.names for e in found.confusion] == [coulomb.names]
+    assert found.probabilities[0] == pytest.approx(0.95, abs=0.01)
+    apart = verdict(entry(["coulomb_friction@joint/b"], 100.0, 0.0), stribeck)
+    assert apart.verdict == "ambiguous"
+    assert are_kin("coulomb_friction@joint/a", "stribeck_friction@joint/a")
+    assert not are_kin("coulomb_friction@joint/a", "coulomb_friction@joint/b")
+
+
+def test_more_effects_have_to_be_worth_it():
+    single, small = entry(["a@x"], 100.0, 0.03), entry(["a@x", "b@y"], 120.0, 0.02)
+    assert verdict(single, small).best.names == ["a@x"]
+    assert verdict(single, entry(["a@x", "b@y"], 120.0, 0.002)).best.names == ["a@x", "b@y"]
+    assert verdict(single, entry(["c@x", "b@y"], 120.0, 0.02)).best.names == ["c@x", "b@y"]
+    assert verdict(entry(["a@x"], 100.0, 0.2), small).best.names == ["a@x", "b@y"]
+    assert verdict(single, entry(["a@x", "b@y"], 100.0, 0.03)).best.names == ["a@x"]
+
+
+def test_a_set_that_wins_in_few_recordings_is_less_probable():
+    steady, rest = np.full(WINDOWS, 100.0), np.full(WINDOWS, 100.0)
+    rest[:2] -= 4.0
+    first, second = entry(["a@x"], 0.0, 0.0), entry(["b@x"], 0.0, 0.0)
+    first.scores, second.scores = steady, rest
+    found = verdict(first, second)
+    assert found.verdict == "ambiguous"
+    assert 0.8 < found.probabilities[0] < 0.95
