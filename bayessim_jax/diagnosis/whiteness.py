@@ -60,17 +60,24 @@ def _slow(r: Array, cosines: Array) -> Array:
     return (jnp.einsum("mr,wro->wmo", cosines, r) ** 2).sum(1)
 
 
+def _absorb(r: Array, q: Array) -> Array:
+    """What windows' initial states leave of residuals; `q` is a basis of what they can explain."""
+    flat = r.reshape(len(r), -1)
+    return (flat - jnp.einsum("wkc,wc->wk", q, jnp.einsum("wkc,wk->wc", q, flat))).reshape(r.shape)
+
+
 @jax.jit
-def _null(keys: Any, slopes: Array, measured: Array, cosines: Array, known: Array) -> Float[Array, "draws windows obs"]:
+def _slow_left(r: Array, q: Array, cosines: Array) -> Float[Array, "windows obs"]:
+    return _slow(_absorb(r, q), cosines)
+
+
+@jax.jit
+def _null(keys: Any, q: Array, measured: Array, cosines: Array, known: Array) -> Float[Array, "draws windows obs"]:
     """Slow power of what a fit leaves of white noise."""
-    windows, _, k = slopes.shape
-    shape = measured.shape
-    q, _ = jnp.linalg.qr(jnp.swapaxes(slopes, 1, 2))  # what each window can absorb by itself
 
     def one(key: Any) -> Array:
-        noise = jnp.where(measured, known + jax.random.normal(key, shape, slopes.dtype), 0.0).reshape(windows, k)
-        left = noise - jnp.einsum("wkc,wc->wk", q, jnp.einsum("wkc,wk->wc", q, noise))
-        return _slow(left.reshape(shape), cosines)
+        noise = jnp.where(measured, known + jax.random.normal(key, measured.shape, q.dtype), 0.0)
+        return _slow(_absorb(noise, q), cosines)
 
     return jax.lax.map(one, keys, batch_size=16)
 
@@ -84,24 +91,19 @@ def judge_misfit(
 ) -> Misfit:
     """Test the residuals of a fit against those of white noise; `slopes` are those of predictions along δ.
 
-    `known` is an error that predictions have for another reason, such as the time step.
+    `known` is an error that predictions have for another reason, such as the time step. In a window it explains at most
+    what is seen there: where the simulation is chaotic it is large, and is no excuse for what other windows show.
     """
     noise = np.maximum(difference_noise(residual, measured), 1e-300)
     rows, obs = measured.shape[1:]
     slopes = (slopes.reshape(*slopes.shape[:2], rows, obs) / noise).reshape(slopes.shape)
-    cosines = jnp.asarray(_cosines(rows))
-    null = np.asarray(
-        _null(
-            jax.random.split(key, BOOTSTRAPS),
-            slopes,
-            jnp.asarray(measured),
-            cosines,
-            jnp.asarray(known / noise * np.ones(measured.shape)),
-        )
-    )
-    scaled = jnp.asarray(np.where(measured, residual / noise, 0.0))
-    power = np.asarray(_slow(scaled, cosines))
-    expected = null.mean(0)
-    seen = power.sum()
-    p_value = (1 + (null.sum((1, 2)) >= seen).sum()) / (1 + BOOTSTRAPS)
-    return Misfit(float(p_value), power - expected, noise)
+    q, _ = jnp.linalg.qr(jnp.swapaxes(slopes, 1, 2))
+    cosines, there = jnp.asarray(_cosines(rows)), jnp.asarray(measured)
+    power = np.asarray(_slow(jnp.asarray(np.where(measured, residual / noise, 0.0)), cosines))
+    error = jnp.where(there, jnp.asarray(known / noise * np.ones(measured.shape)), 0.0)
+    excused = np.asarray(_slow_left(error, q, cosines)).sum(1)
+    share = np.minimum(power.sum(1) / np.maximum(excused, 1e-300), 1.0)
+    keys = jax.random.split(key, BOOTSTRAPS)
+    null = np.asarray(_null(keys, q, there, cosines, error * jnp.asarray(np.sqrt(share))[:, None, None]))
+    p_value = (1 + (null.sum((1, 2)) >= power.sum()).sum()) / (1 + BOOTSTRAPS)
+    return Misfit(float(p_value), power - null.mean(0), noise)

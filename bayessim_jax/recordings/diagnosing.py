@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from bayessim_jax.diagnosis.bench import Bench, Candidate
+from bayessim_jax.diagnosis.experiment import Experiment
 from bayessim_jax.diagnosis.flexible import FEATURES, FlexibleForce, features
 from bayessim_jax.diagnosis.locate import Location, find_regime, find_windows_of, shares_from_left
 from bayessim_jax.diagnosis.procedure import Problem, detect, is_mismatch, name_effects
@@ -22,6 +23,7 @@ from bayessim_jax.diagnosis.verdict import Diagnosis, Entry, Thresholds, share_l
 from bayessim_jax.effects import EFFECTS, Scales, effect_places, recorded_scales
 from bayessim_jax.inference.scores import Score, compare, error_spread, score
 from bayessim_jax.inference.shooting import Shots
+from bayessim_jax.recordings.experiments import advise, next_experiment
 from bayessim_jax.recordings.identification import Settled, channel_scale, settle_step, start_spread
 from bayessim_jax.recordings.shots import CaseModel, split_windows, take
 from bayessim_jax.recordings.smoothing import smooth_recordings
@@ -62,7 +64,8 @@ class CaseDiagnosis:
     noise_floor: float
     theta: dict[str, tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]]
     """Mean and standard deviation of the parameters, `baseline` and `augmented`."""
-    next_experiment: str
+    experiment: Experiment | None
+    """What would tell the members of the confusion set apart."""
 
     @property
     def shares_left(self) -> list[float]:
@@ -117,7 +120,7 @@ class CaseDiagnosis:
                 }
                 for k, name in enumerate(self.model.margins.names)
             },
-            "next_experiment": self.next_experiment,
+            "next_experiment": advise(self.result, self.experiment),
         }
 
     def _effects(self, entry: Entry) -> list[dict[str, Any]]:
@@ -194,7 +197,7 @@ def _take_case(key: Array, model: CaseModel, *, say: Callable[[str], None] = lam
     windows = join(fitted, held)
     system: Any = model.system
     pairs = tuple((effect, place) for effect in EFFECTS.values() for place in effect_places(effect, system))
-    joints = [f"joint/{name}" for name, kind, *_ in model.case.layout.joints if kind in (2, 3)]
+    joints = [f"joint/{name}" for name, *_ in model.case.layout.single]
     rows = max(round(PIECE / model.system.dt), LEAST)
     smooth = _smoothed(model)
     pieces = cut_windows(fitted, rows)
@@ -220,7 +223,7 @@ def _motion(model: CaseModel, windows: Windows, smooth: Windows) -> Motion:
 
 def _smoothed(model: CaseModel) -> CaseModel:
     """The same case with smoothed motion."""
-    joints = [(q, v) for _, kind, q, v in model.case.layout.joints if kind in (2, 3)]
+    joints = [(q, v) for _, q, v in model.case.layout.single]
     return dataclasses.replace(model, recordings=smooth_recordings(model.recordings, joints))
 
 
@@ -297,7 +300,7 @@ def diagnose_case(
         scale=scale,
         noise_floor=_floor(bench, result.best, scale, model, shots),
         theta={which: _theta(bench, entry) for which, entry in entries.items()},
-        next_experiment=_advice(result),
+        experiment=next_experiment(model, bench, result, shots),
     )
 
 
@@ -330,7 +333,7 @@ class _Residual:
 def _fit_residual_force(key: Array, taken: _Taken, none: Entry) -> _Residual | None:
     """A flexible force at all joints, what each joint alone explains, and the forces along the recordings."""
     model, problem = taken.model, taken.problem
-    joints = [(name, q, v) for name, kind, q, v in model.case.layout.joints if kind in (2, 3)]
+    joints = model.case.layout.single
     if not joints:
         return None
     places = [f"joint/{name}" for name, _, _ in joints]
@@ -422,32 +425,3 @@ def _joint_of(model: CaseModel, place: str) -> str:
     if kind == "joint":
         return f"joint/{rest.removesuffix('/qpos').removesuffix('/qvel')}"
     return place
-
-
-HINTS = {
-    frozenset(
-        {"actuator_delay", "sensor_delay"}
-    ): "a recording of the motor's current, or another joint that feels it: "
-    "from command and position of one joint alone the two delays cannot be told apart",
-    frozenset(
-        {"actuator_delay", "actuator_lag"}
-    ): "a chirp: a delay keeps the gain and turns the phase, a lag loses gain",
-    frozenset(
-        {"coulomb_friction", "stribeck_friction"}
-    ): "slow motion in both directions, below a tenth of the usual speed",
-    frozenset({"coulomb_friction", "backlash"}): "slow reversals at two amplitudes",
-    frozenset({"viscous_friction", "back_emf"}): "motion with the motor off (open circuit)",
-    frozenset({"viscous_friction", "quadratic_drag"}): "motion over a threefold range of speeds",
-    frozenset({"actuator_bias", "sensor_offset"}): "the joint held at several known angles",
-    frozenset({"actuator_gain", "armature"}): "a known load held still, and then fast motion",
-}
-
-
-def _advice(result: Diagnosis) -> str:
-    """An experiment that would tell the members of the confusion set apart."""
-    if result.verdict != "ambiguous":
-        return ""
-    first, second = result.confusion[0].names, result.confusion[1].names
-    kinds = frozenset(name.partition("@")[0] for name in {*first} ^ {*second})
-    what = HINTS.get(kinds, "larger and faster motion, and motion with the motors off")
-    return f"{what}: it separates {' + '.join(first)} from {' + '.join(second)}"

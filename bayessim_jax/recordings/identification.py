@@ -101,9 +101,9 @@ def start_spread(model: CaseModel, fit: Fit) -> Float[np.ndarray, " n"]:
     found = 1.4826 * np.median(np.abs(moved), axis=0)
     if isinstance(model.system, Restarted):
         return np.asarray(fit.sigma) if len(found) == len(model.channels) else found
-    joints, nv = model.case.layout.joints, model.system.engine.model.nv
+    joints, nv = model.case.layout.single, model.system.engine.model.nv
     sigma = dict(zip(model.channels, np.asarray(fit.sigma), strict=True))
-    names = {v: (f"joint/{name}/qpos", f"joint/{name}/qvel") for name, kind, _, v in joints if kind in (2, 3)}
+    names = {v: (f"joint/{name}/qpos", f"joint/{name}/qvel") for name, _, v in joints}
     for v, (place, rate) in names.items():
         if place in sigma:
             found[v] = sigma[place]

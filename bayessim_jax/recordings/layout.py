@@ -45,6 +45,11 @@ class Layout:
         return (*self.qpos, *self.qvel, *self.sensors, *self.ctrl)
 
     @property
+    def single(self) -> tuple[tuple[str, int, int], ...]:
+        """Name, place in `qpos` and place in `qvel` of the joints with one coordinate, slides and hinges."""
+        return tuple((name, q, v) for name, kind, q, v in self.joints if kind in (SLIDE, HINGE))
+
+    @property
     def hinges(self) -> tuple[tuple[int, int], ...]:
         """Places in `qpos` and `qvel` of the hinge joints."""
         return tuple((q, v) for _, kind, q, v in self.joints if kind == HINGE)

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from bayessim_jax import __version__
 from bayessim_jax.effects import write_mjcf
 from bayessim_jax.recordings.evaluation import write_state
+from bayessim_jax.recordings.experiments import write_experiment
 from bayessim_jax.recordings.files import replace_file, to_json, write_text
 from bayessim_jax.recordings.loading import LoadedCase, load_case
 from bayessim_jax.recordings.mjcf import referenced_files
@@ -64,9 +65,14 @@ def write_model(
 
 
 def write_diagnosis(folder: RunFolder, diagnosis: CaseDiagnosis, seed: int) -> None:
-    """Write `diagnosis.json`, `posterior.nc`, `simulators.json` and, where MJCF can say it, `model_augmented.xml`."""
+    """Write `diagnosis.json`, `posterior.nc`, `simulators.json` and, where MJCF can say it, `model_augmented.xml`.
+
+    `next_experiment.csv` too, where one would tell the members of the confusion set apart.
+    """
     write_text(folder.path / "diagnosis.json", to_json(diagnosis.table(), indent=2) + "\n")
     write_state(folder, diagnosis)
+    if diagnosis.experiment is not None:
+        write_experiment(folder.path / "next_experiment.csv", diagnosis.model, diagnosis.experiment)
     _write_laplace(folder.path / "posterior.nc", diagnosis, seed)
     theta, _ = diagnosis.theta["augmented"]
     values = dict(zip(diagnosis.model.margins.names, theta.tolist(), strict=True))

@@ -9,6 +9,7 @@ import numpy as np
 
 from bayessim_jax.diagnosis.verdict import share_left
 from bayessim_jax.recordings.diagnosing import CaseDiagnosis
+from bayessim_jax.recordings.experiments import advise
 from bayessim_jax.report import html
 from bayessim_jax.report.misfit import candidates_plot, misfit_map
 from bayessim_jax.report.residuals import residual_plot
@@ -60,8 +61,9 @@ def render(diagnosis: CaseDiagnosis, facts: Mapping[str, Any]) -> str:
     notices = []
     if result.verdict == "no_mismatch":
         notices.append(html.notice("The residuals are as white as noise leaves them.", good=True))
-    if diagnosis.next_experiment:
-        notices.append(html.notice(f"Next experiment: {diagnosis.next_experiment}."))
+    advice = advise(result, diagnosis.experiment)
+    if advice:
+        notices.append(html.notice(f"Next experiment: {advice}."))
     body = [
         f"<h1>{html.escape(case.case.name)}</h1>",
         f'<p class="lead">{html.escape(headline(diagnosis))}</p>',
