@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from bayessim_jax.beliefs.margins import Margins
 from bayessim_jax.diagnosis.bench import SLOTS, Bench, Candidate
 from bayessim_jax.diagnosis.response import Motion
+from bayessim_jax.diagnosis.scene import Scene
 from bayessim_jax.diagnosis.screen import Screen, Screened
 from bayessim_jax.diagnosis.verdict import Diagnosis, Entry, Thresholds, are_kin, decide, share_left
 from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, judge_misfit
@@ -29,6 +30,8 @@ SCREENED = 60
 """Windows with which every candidate is tried at first."""
 FINALISTS, LEADERS, PAIRS = 7, 2, 4
 """Single effects that are simulated at most, at least, and pairs."""
+FINISHED = 14
+"""Single effects that are fitted to the end along the motion."""
 GLANCED = 4
 """Partners of a leader that are fitted to the end."""
 WORTH = 0.5
@@ -105,7 +108,8 @@ class Problem:
         group = self.group[rows]
         labels = sorted(set(group.tolist()))
         folds = np.array([np.isin(group, labels[i::FOLDS]) for i in range(min(FOLDS, len(labels)))])
-        return Screen(self.system, self.margins, pairs, self.scales, shots, motion, folds, self.step, slots)
+        scene = Scene(self.system, self.margins, pairs, self.scales, shots, motion, self.step, slots)
+        return Screen(scene, folds)
 
     def bench(self, pairs: Sequence[tuple[Any, str]], slots: int = SLOTS) -> Bench:
         """A bench for some of the pairs."""
@@ -151,23 +155,27 @@ def name_effects(
     say(f"holding {len(problem.pairs)} candidates against the recorded motion")
     nothing = screen.begin(start.z[: screen.d], start.sigma)
     random = np.random.default_rng(0)
-    ranked = _rank(screen, nothing, random, say)
+    ranked, listed = _rank(screen, nothing, random, say)
     if not ranked:
         return Diagnosis("unexplained", *detect(key, problem, _still(problem, start)), [])
     singles = _finalists(screen, nothing, ranked)
     work = _bench_of(key, problem, singles, say)
     none = _without(work, problem, detected)
     entries = _finish(work, none, singles)
-    if not entries or share_left(entries[0].misfit, none.misfit) > thresholds.enough:
+    left = share_left(entries[0].misfit, none.misfit) if entries else 1.0
+    if left > thresholds.enough:
         say("one effect is not enough: trying pairs")
-        pairs = _pair(screen, ranked, random)[:PAIRS]
-        alone = {k for pair in pairs for k in pair.candidate.effects}
-        best = {work.numbers[k] for entry in entries[:2] for k in entry.candidate.effects}
-        kept = [*pairs, *(found for found in ranked if found.candidate.effects[0] in alone | best)]
-        work = _bench_of(key, problem, kept, say)
-        none = _without(work, problem, detected)
-        entries = _finish(work, none, kept)
-    listed = [(screen.name(found.candidate), found.score - nothing.score) for found in ranked]
+        before = screen.misfit(key, nothing)
+        remain = lambda found: share_left(screen.misfit(key, found), before)  # noqa: E731
+        worth = thresholds.worth * remain(ranked[0]) if left <= thresholds.left else np.inf
+        pairs = [pair for pair in _pair(screen, ranked, random)[:PAIRS] if remain(pair) < worth]
+        if pairs:
+            alone = {k for pair in pairs for k in pair.candidate.effects}
+            best = {work.numbers[k] for entry in entries[:2] for k in entry.candidate.effects}
+            kept = [*pairs, *(found for found in ranked if found.candidate.effects[0] in alone | best)]
+            work = _bench_of(key, problem, kept, say)
+            none = _without(work, problem, detected)
+            entries = _finish(work, none, kept)
     return decide(work.bench, none, entries, work.group, thresholds, listed)
 
 
@@ -183,17 +191,23 @@ def _bench_of(key: PRNGKeyArray, problem: Problem, candidates: Sequence[Screened
     return _Work(key, bench, problem.group, noise_floor(bench.shots), say, tuple(numbers))
 
 
-def _rank(screen: Screen, nothing: Screened, random: np.random.Generator, say: Callable[[str], None]) -> list[Screened]:
-    """Every single effect, the best first."""
-    found = []
+def _rank(
+    screen: Screen, nothing: Screened, random: np.random.Generator, say: Callable[[str], None]
+) -> tuple[list[Screened], list[tuple[str, float]]]:
+    """The best single effects, the best first; and every one with what it gains where it was fitted."""
+    every = []
     for k in range(len(screen.pairs)):
         candidate = Candidate((k,))
-        tried = screen.try_candidate(candidate, nothing, random) if screen.takes(candidate) else None
-        if tried is not None and np.isfinite(tried.score):
-            found.append(tried)
+        begun = screen.begin_candidate(candidate, nothing, random) if screen.takes(candidate) else None
+        if begun is not None and np.isfinite(begun.likelihood):
+            every.append(begun)
         if k % 40 == 39:
             say(f"{k + 1} of {len(screen.pairs)}")
-    return sorted(found, key=lambda item: -item.score)
+    every.sort(key=lambda begun: -begun.likelihood)
+    ended = [screen.finish_candidate(begun, nothing) for begun in every[:FINISHED]]
+    ranked = sorted((e for e in ended if e is not None and np.isfinite(e.score)), key=lambda e: -e.score)
+    without = screen.likelihood(nothing)
+    return ranked, [(screen.name(begun.candidate), begun.likelihood - without) for begun in every]
 
 
 def _finalists(screen: Screen, nothing: Screened, ranked: Sequence[Screened]) -> list[Screened]:
@@ -226,8 +240,10 @@ def _pair(screen: Screen, ranked: Sequence[Screened], random: np.random.Generato
             if np.isfinite(cost):
                 first.append((cost, pair))
         first.sort(key=lambda item: item[0])
-        tried = [screen.try_candidate(pair, known, random) for _, pair in first[:GLANCED]]
-        found += [t for t in tried if t is not None and np.isfinite(t.score)]
+        for _, pair in first[:GLANCED]:
+            begun = screen.begin_candidate(pair, known, random)
+            ended = screen.finish_candidate(begun, known) if begun is not None else None
+            found += [ended] if ended is not None and np.isfinite(ended.score) else []
     return sorted(found, key=lambda item: -item.score)
 
 

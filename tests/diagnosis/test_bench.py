@@ -101,11 +101,13 @@ def test_the_concealed_effect_comes_out_first_along_the_motion(problem):
     screen = problem.screen(problem.pairs)
     nothing = screen.begin(jnp.array([0.0]), jnp.array([0.02, 0.2]))
     random = np.random.default_rng(0)
-    found = [screen.try_candidate(Candidate((k,)), nothing, random) for k in range(len(problem.pairs))]
+    begun = [screen.begin_candidate(Candidate((k,)), nothing, random) for k in range(len(problem.pairs))]
+    found = [screen.finish_candidate(item, nothing) for item in begun]
+    assert int(np.argmax([item.likelihood for item in begun])) in (0, 1)
     scores = [item.score - nothing.score for item in found]
     assert int(np.argmax(scores)) in (0, 1)
     assert max(scores[2:]) < 0.5 * scores[0]
-    level = screen.margin[0][0].value(found[0].p[screen.d])
+    level = screen.scene.margin[0][0].value(found[0].p[screen.d])
     bench = problem.bench(problem.pairs)
     fit = bench.fit(
         Candidate((0,)), found[0].p, jnp.zeros((len(problem.group), 2)), found[0].sigma, problem.shots.measured
