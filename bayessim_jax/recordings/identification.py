@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from bayessim_jax.inference.direct import DirectPosterior, fit_direct, sample_direct
+from bayessim_jax.diagnosis.whiteness import difference_noise
+from bayessim_jax.inference.direct import DirectPosterior, fit_direct, noise_floor, sample_direct
 from bayessim_jax.inference.identifiability import Identifiability, find_unidentified
 from bayessim_jax.inference.replay import Restarted
 from bayessim_jax.inference.scores import (
@@ -170,10 +171,11 @@ class Settled:
 def settle_step(
     key: Array, model: CaseModel, windows: Windows, *, say: Callable[[str], None] = lambda text: None
 ) -> Settled:
-    """Fit a case, on the model's own time step or, where that explains the recordings better, on a finer one.
+    """Fit a case, on the model's own time step or, where that is too coarse for the noise, on a finer one.
 
     An integration error looks like missing physics. Where the error of the model's time step is of the size of the
-    noise, the fit is repeated with a quarter of it, and the one that leaves less noise is kept.
+    sensors' noise, the fit is repeated with a quarter of it, and kept unless it explains the recordings less well: a
+    machine takes no steps.
     """
     predict, shots = predictor(model), model.shots(windows)
     fit = fit_direct(key, predict, shots, model.margins.size, step=model.step, say=say)
@@ -183,14 +185,16 @@ def settle_step(
     coarse = predict_windows(predict, shots, fit.z, fit.delta)
     fine = predict_windows(predictor(finer), shots, fit.z, fit.delta)
     error = np.where(np.asarray(shots.measured) & np.isfinite(coarse - fine), coarse - fine, 0.0)
-    counts = np.maximum(np.asarray(shots.measured).sum((0, 1)), 1)
-    size = float((np.sqrt((error**2).sum((0, 1)) / counts) / np.asarray(fit.sigma)).max())
+    measured = np.asarray(shots.measured)
+    noise = difference_noise(np.where(measured, np.nan_to_num(np.asarray(shots.y) - coarse), 0.0), measured)
+    typical = np.sqrt(np.median((error**2).sum(1) / np.maximum(measured.sum(1), 1), axis=0))
+    size = float((typical / np.maximum(noise, np.asarray(noise_floor(shots)))).max())
     if not size > NEGLIGIBLE:
         return Settled(model, fit, error)
     again = fit_direct(key, predictor(finer), shots, model.margins.size, start=fit, step=model.step, say=say)
     gain = float((np.log(np.asarray(fit.sigma) / np.asarray(again.sigma))).mean())
     h = model.system.dt / model.system.substeps
-    if gain <= 0.01:
+    if gain < -0.01:
         return Settled(model, fit, error)
     remark = f"time step {h / REFINED:g} s instead of {h:g} s: the integration error is {size:.1f} times the noise"
     say(remark)
