@@ -33,6 +33,8 @@ __all__ = ["CaseDiagnosis", "diagnose_case"]
 
 MOST_FITTED, MOST_HELD = 44, 20
 """Windows that choose and windows that judge; of longer recordings they are spread evenly."""
+SMALLEST = 0.02
+"""Share of the misfit below which a place is not listed."""
 LONG = 15
 """Steps of the solver for a force with many weights."""
 PIECE, LEAST = 0.16, 16
@@ -377,29 +379,41 @@ def _gears(model: CaseModel) -> Float[np.ndarray, "nu nv"]:
 
 
 def _locations(taken: _Taken, result: Diagnosis, residual: _Residual | None) -> list[Location]:
-    """Joints by their share; what a verdict names stands under its own name."""
+    """Joints and channels by their share of the misfit: those of the effects that explain it, or else of any force."""
     model, pieces = taken.model, taken.pieces
     every = np.maximum(result.baseline.misfit.excess, 0.0)
     names = [model.recordings[i].name for i in pieces.recording]
-    length = float(pieces.time.max())
-    when = find_windows_of(every.sum(1), names, pieces.start, length)
+    when = find_windows_of(every.sum(1), names, pieces.start, float(pieces.time.max()))
     if residual is None:
         return _by_channel(model, every.sum(0), when)
-    named = {}
-    if result.verdict == "explained":
-        own = [name.partition("@")[2] for name in result.best.names]
-        named = {_joint_of(model, place): place for place in own}
+    shares = _shares_of_effects(model, result)
+    if not all(_joint_of(model, place) in residual.forces for place in shares) or not shares:
+        shares = dict(zip(residual.places, residual.shares.tolist(), strict=True))
+    ranked = sorted(shares.items(), key=lambda item: -item[1])
+    kept = [item for k, item in enumerate(ranked) if k == 0 or item[1] >= SMALLEST]
+    total = max(sum(share for _, share in kept), 1e-12)
     found = []
-    for k in np.argsort(-residual.shares).tolist():
-        place = str(residual.places[k])
-        force, position, velocity, drive, time = residual.forces[place]
-        regime = find_regime(force, position, velocity, drive, time, result.bench.scales[place])
-        if residual.shares[k] >= 0.02 or not found:
-            found.append(Location(named.get(place, place), float(residual.shares[k]), regime, when))
-    total = sum(location.share for location in found)
-    for location in found:
-        location.share = round(location.share / total, 4)
-    return sorted(found, key=lambda place: (place.at not in named.values(), -place.share))
+    for place, share in kept:
+        joint = _joint_of(model, place)
+        force, position, velocity, drive, time = residual.forces[joint]
+        regime = find_regime(force, position, velocity, drive, time, result.bench.scales[joint])
+        found.append(Location(place, round(share / total, 4), regime, when))
+    return found
+
+
+def _shares_of_effects(model: CaseModel, result: Diagnosis) -> dict[str, float]:
+    """What of the misfit the effects at every joint or channel explain: what is left without them."""
+    if not result.confusion:
+        return {}
+    names = result.best.names
+    alone = {tuple(e.names): share_left(e.misfit, result.baseline.misfit) for e in result.entries}
+    shares: dict[str, float] = {}
+    for name in names:
+        place = name.partition("@")[2]
+        place = place if place in model.channels else _joint_of(model, place)
+        rest = tuple(other for other in names if other != name)
+        shares[place] = shares.get(place, 0.0) + alone.get(rest, 1.0)
+    return shares
 
 
 def _by_channel(
@@ -424,4 +438,9 @@ def _joint_of(model: CaseModel, place: str) -> str:
         return f"joint/{m.joint(joint).name}" if 0 <= joint < m.njnt else place
     if kind == "joint":
         return f"joint/{rest.removesuffix('/qpos').removesuffix('/qvel')}"
+    if kind in ("body", "geom"):
+        body = int(m.body(rest).id) if kind == "body" else int(m.geom_bodyid[m.geom(rest).id])
+        while body and not m.body_jntnum[body]:
+            body = int(m.body_parentid[body])
+        return f"joint/{m.joint(int(m.body_jntadr[body])).name}" if body else place
     return place
