@@ -3,11 +3,15 @@ BIN := .venv/bin
 
 .PHONY: demo test lint slow clean
 
-# The main job: Algorithm 1 on CartPole against Gymnasium's CartPole-v1 with hidden length and mass.
+# The main job: Algorithm 1 on CartPole against Gymnasium's CartPole-v1 with hidden length and mass; and a diagnosis of
+# recordings in which an effect is concealed (made by `bayessim conceal`).
 demo: .venv/installed
-	rm -rf runs/demo
+	rm -rf runs/demo runs/demo-physics
 	$(BIN)/bayessim online cartpole --truth length=0.5 mass=0.3 --rounds 20 --out runs/demo
-	@echo "Open runs/demo/report.html"
+	$(BIN)/bayessim diagnose docs/examples/pendulum --out runs/demo-physics
+	@echo "What was hidden is in docs/examples/pendulum/sealed.json, which the diagnosis never reads:"
+	@$(BIN)/python -c "import json; print(json.load(open('docs/examples/pendulum/sealed.json'))['effects'][0])"
+	@echo "Open runs/demo/report.html and runs/demo-physics/report.html"
 
 test: .venv/installed-test
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
