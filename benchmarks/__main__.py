@@ -1,4 +1,4 @@
-"""Benchmarks: `python -m benchmarks online | estimator | scaling | engines | fetch | concealed | mppi`."""
+"""Benchmarks: `python -m benchmarks online | estimator | scaling | engines | fetch | concealed | thresholds | mppi`."""
 
 from __future__ import annotations
 
@@ -61,6 +61,13 @@ def main() -> None:
     concealed.add_argument("--seed", type=int, default=1)
     concealed.add_argument("--out", type=Path, help="file of JSON lines to append cases to, and to resume from")
 
+    thresholds = commands.add_parser("thresholds", help="diagnoses with the whole family of the effect left out")
+    thresholds.add_argument(
+        "--rigs", nargs="+", choices=_RIGS, help="machines; those of one and two joints if left out"
+    )
+    thresholds.add_argument("--cases", type=int, default=60)
+    thresholds.add_argument("--out", type=Path, help="file of JSON lines to append cases to, and to resume from")
+
     mppi = commands.add_parser("mppi", help="a control step of DISCO on the pendulum against pytorch_mppi")
     mppi.add_argument("--repeats", type=int, default=7)
     _add_common(mppi)
@@ -83,6 +90,10 @@ def main() -> None:
         from benchmarks.estimator import compare_estimators
 
         compare_estimators(options)
+    elif options.command == "thresholds":
+        from benchmarks.thresholds import leave_families_out
+
+        leave_families_out(options)
     elif options.command == "mppi":
         from benchmarks.mppi import compare_planners
 

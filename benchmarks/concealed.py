@@ -18,8 +18,20 @@ from benchmarks.worlds import MODELS, RIGS, make_case
 
 if TYPE_CHECKING:
     from argparse import Namespace
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
-__all__ = ["GROUPS", "diagnose_concealed", "draw_cases", "judge", "make_drawn", "summarize"]
+    from bayessim_jax.recordings.diagnosing import CaseDiagnosis
+
+__all__ = [
+    "GROUPS",
+    "diagnose_concealed",
+    "diagnose_drawn",
+    "draw_cases",
+    "judge",
+    "make_drawn",
+    "resumed",
+    "summarize",
+]
 
 GROUPS = {"single": 0.37, "weak": 0.1, "pair": 0.1, "unknown": 0.18, "clean": 0.25}
 """Shares of the cases: one effect, one weak effect, two, one of no library, none."""
@@ -136,18 +148,16 @@ def judge(sealed: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def diagnose_concealed(options: Namespace) -> None:
-    """Diagnose the cases that are not in the file yet, and print what became of all."""
-    from bayessim_jax.recordings.diagnosing import diagnose_case
-    from bayessim_jax.recordings.evaluation import BEFORE_ROWS
-    from bayessim_jax.recordings.loading import load_case
-    from bayessim_jax.recordings.shots import case_model
+def resumed(
+    cases: Iterable[dict[str, Any]], out: Path | None, make: Callable[[Path, dict[str, Any]], dict[str, Any]]
+) -> Iterator[dict[str, Any]]:
+    """Yield what `make` finds in the folder of every case; rows that the file `out` holds already are not made again.
 
-    jax.config.update("jax_enable_x64", True)
-    cases = draw_cases(options.rigs or list(MODELS), options.cases, options.seed)
+    A machine that cannot have its effect as strong as drawn is told and left out.
+    """
     done: dict[int, dict[str, Any]] = {}
-    if options.out is not None and options.out.exists():
-        rows = [json.loads(line) for line in options.out.read_text(encoding="utf-8").splitlines()]
+    if out is not None and out.exists():
+        rows = [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()]
         done = {row["case"]["seed"]: row for row in rows}
     for case in cases:
         row = done.get(case["seed"])
@@ -160,32 +170,56 @@ def diagnose_concealed(options: Namespace) -> None:
                     print(f"{'not made':<12} {case['rig']} {error}", flush=True)
                     continue
                 start = time.perf_counter()
-                model = case_model(load_case(path).check(), before=BEFORE_ROWS)
-                table = diagnose_case(jax.random.key(case["seed"]), model).table()
-                seconds = time.perf_counter() - start
-            row = {
-                "case": case,
-                "sealed": sealed,
-                "seconds": round(seconds, 1),
-                **judge(sealed, table),
-                "verdict": table["verdict"],
-                "p_value": table["misfit"]["p_value"],
-                "nrmse": {k: v["nrmse"] for k, v in table["fit"].items() if isinstance(v, dict)},
-                "noise_floor": table["fit"]["noise_floor"],
-                "parameters": table["parameters"],
-                "effects": table["effects"],
-            }
-            if options.out is not None:
-                with options.out.open("a", encoding="utf-8") as file:
+                found = make(path, case)
+                seconds = round(time.perf_counter() - start, 1)
+            row = {"case": case, "sealed": sealed, "seconds": seconds, **found}
+            if out is not None:
+                out.parent.mkdir(parents=True, exist_ok=True)
+                with out.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(row) + "\n")
-            jax.clear_caches()
-        done[case["seed"]] = row
+        yield row
+
+
+def diagnose_drawn(path: Path, case: dict[str, Any], effects: Sequence[Any] | None = None) -> CaseDiagnosis:
+    """Diagnose a case that was drawn."""
+    from bayessim_jax.recordings.diagnosing import diagnose_case
+    from bayessim_jax.recordings.evaluation import BEFORE_ROWS
+    from bayessim_jax.recordings.loading import load_case
+    from bayessim_jax.recordings.shots import case_model
+
+    model = case_model(load_case(path).check(), before=BEFORE_ROWS)
+    found = diagnose_case(jax.random.key(case["seed"]), model, effects=effects)
+    jax.clear_caches()
+    return found
+
+
+def diagnose_concealed(options: Namespace) -> None:
+    """Diagnose the cases that are not in the file yet, and print what became of all."""
+    jax.config.update("jax_enable_x64", True)
+
+    def make(path: Path, case: dict[str, Any]) -> dict[str, Any]:
+        diagnosis = diagnose_drawn(path, case)
+        table = diagnosis.table()
+        return {
+            "verdict": table["verdict"],
+            "p_value": table["misfit"]["p_value"],
+            "left": diagnosis.shares_left[:3],
+            "nrmse": {k: v["nrmse"] for k, v in table["fit"].items() if isinstance(v, dict)},
+            "noise_floor": table["fit"]["noise_floor"],
+            **{key: table[key] for key in ("parameters", "effects", "confusion_set", "locations")},
+        }
+
+    rows = []
+    cases = draw_cases(options.rigs or list(MODELS), options.cases, options.seed)
+    for made in resumed(cases, options.out, make):
+        row = made | judge(made["sealed"], made)
+        rows.append(row)
         hidden = ", ".join(f"{e['effect']}@{e['at']} {e['strength']['measured']:g}" for e in row["sealed"]["effects"])
         print(
-            f"{row['outcome']:<12} {case['rig']} {hidden or 'clean'} -> {row['found']} {row['seconds']:.0f} s",
+            f"{row['outcome']:<12} {row['case']['rig']} {hidden or 'clean'} -> {row['found']} {row['seconds']:.0f} s",
             flush=True,
         )
-    print("\n" + summarize([done[case["seed"]] for case in cases if case["seed"] in done]))
+    print("\n" + summarize(rows))
 
 
 def summarize(rows: list[dict[str, Any]]) -> str:

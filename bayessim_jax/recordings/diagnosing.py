@@ -190,15 +190,15 @@ class _Taken:
     settled: Settled
 
 
-def _take_case(key: Array, model: CaseModel, *, say: Callable[[str], None] = lambda text: None) -> _Taken:
-    """Windows, smoothed motion, every registered effect at every place, and the fit without effects."""
+def _take_case(key: Array, model: CaseModel, effects: Sequence[Any], say: Callable[[str], None]) -> _Taken:
+    """Windows, smoothed motion, every effect at every place, and the fit without effects."""
     split = [_thin(part, most) for part, most in zip(split_windows(model), (MOST_FITTED, MOST_HELD), strict=True)]
     fitted, held = split
     settled = settle_step(key, model, fitted, say=say)
     model = settled.model
     windows = join(fitted, held)
     system: Any = model.system
-    pairs = tuple((effect, place) for effect in EFFECTS.values() for place in effect_places(effect, system))
+    pairs = tuple((effect, place) for effect in effects for place in effect_places(effect, system))
     joints = [f"joint/{name}" for name, *_ in model.case.layout.single]
     rows = max(round(PIECE / model.system.dt), LEAST)
     smooth = _smoothed(model)
@@ -253,13 +253,17 @@ def diagnose_case(
     key: Array,
     model: CaseModel,
     *,
+    effects: Sequence[Any] | None = None,
     thresholds: Thresholds | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> CaseDiagnosis:
-    """Diagnose a case; raises `ValueError` where nothing can be simulated."""
+    """Diagnose a case; raises `ValueError` where nothing can be simulated.
+
+    `effects` are those that may be missing, all registered ones if left out.
+    """
     fit_key, key = jax.random.split(key)
     say("fitting the simulator as it is")
-    taken = _take_case(fit_key, model, say=say)
+    taken = _take_case(fit_key, model, list(EFFECTS.values()) if effects is None else effects, say)
     model, windows, chosen = taken.model, taken.windows, taken.chosen
     say(f"{int(chosen.sum())} windows choose, {int((~chosen).sum())} judge")
     plain, none = detect(key, taken.whole, taken.settled.fit, taken.settled.error)
