@@ -12,10 +12,22 @@ jax.config.update(
 )
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
+MOST_MAPS = 30_000
+"""Of the 65,530 that a process may have by default; every compiled program takes some."""
+
 
 @pytest.fixture(autouse=True)
-def forget_programs_of_slow_tests(request):
-    """Slow tests compile hundreds of programs, and a process can hold only so many."""
+def forget_programs(request):
+    """A process can hold only so many compiled programs, and slow tests compile hundreds."""
     yield
-    if request.node.get_closest_marker("slow"):
+    if request.node.get_closest_marker("slow") or _maps() > MOST_MAPS:
         jax.clear_caches()
+
+
+def _maps() -> int:
+    """Maps of memory of this process; 0 where the system does not tell."""
+    try:
+        with Path("/proc/self/maps").open("rb") as file:
+            return sum(1 for _ in file)
+    except OSError:
+        return 0

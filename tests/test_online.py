@@ -267,7 +267,7 @@ def test_a_contradicting_recording_no_longer_counts():
         def posterior(self, state, recordings, use):
             return GaussianMixture(jnp.zeros(1), recordings.observations[0, :1], 0.1 * jnp.eye(2)[None])
 
-    means = jnp.array([[0.2, 0.2], [0.8, 0.2], [0.25, 0.3], [0.3, 0.2]])
+    means = jnp.array([[0.2, 0.2], [0.95, 0.2], [0.25, 0.3], [0.3, 0.2]])
     history = jax.tree.map(jnp.asarray, rollout(jax.random.key(0), Pendulum.create(), means[0], _still(), 1))
     history = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (4, *leaf.shape)), history)
     history = history.replace(observations=jnp.broadcast_to(means[:, None], (4, 2, 2)))

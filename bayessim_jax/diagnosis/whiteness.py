@@ -102,7 +102,7 @@ def judge_misfit(
     power = np.asarray(_slow(jnp.asarray(np.where(measured, residual / noise, 0.0)), cosines))
     error = jnp.where(there, jnp.asarray(known / noise * np.ones(measured.shape)), 0.0)
     excused = np.asarray(_slow_left(error, q, cosines)).sum(1)
-    share = np.minimum(power.sum(1) / np.maximum(excused, 1e-300), 1.0)
+    share = np.minimum(power.sum(1) / np.maximum(excused, 1e-30), 1.0)
     keys = jax.random.split(key, BOOTSTRAPS)
     null = np.asarray(_null(keys, q, there, cosines, error * jnp.asarray(np.sqrt(share))[:, None, None]))
     p_value = (1 + (null.sum((1, 2)) >= power.sum()).sum()) / (1 + BOOTSTRAPS)

@@ -200,7 +200,7 @@ def test_a_small_run_end_to_end(tmp_path, capsys):
     assert seen["angle"].shape == (3, 1, 11)
     assert abs(seen["angle"].values[:, :, 0]).max() < 0.2
     truth = facts["truth"]["length"]
-    assert length.attrs["truth"] == truth == pytest.approx(float(tiny_plan().truths[0, 0]))
+    assert length.attrs["truth"] == truth == pytest.approx(float(tiny_plan().truths.first[0, 0]))
     assert float(length.mean()) == pytest.approx(told[-1]["mean"]["length"], rel=1e-5)
     before = (run / "report.html").read_text()
     (run / "report.html").unlink()

@@ -17,6 +17,7 @@ from bayessim_jax.cli.options import Settings
 from bayessim_jax.cli.parsing import UsageError
 from bayessim_jax.cli.session import Session
 from bayessim_jax.recordings.run_folder import RunFolder
+from bayessim_jax.recordings.truths import Truths
 from bayessim_jax.systems import CartPole
 from tests.recordings.synthetic import stacked, state_after
 
@@ -30,7 +31,7 @@ class MadeUp:
         self.settings = replace(SETTINGS, rounds=rounds, seeds=seeds)
         self.setup = SimpleNamespace(system=CartPole.create())
         self.seeds = list(range(3, 3 + seeds))
-        self.truths = np.tile(np.array([0.5, 0.4], np.float32), (seeds, 1))
+        self.truths = Truths.constant(np.tile(np.array([0.5, 0.4], np.float32), (seeds, 1)))
         self.before = before
 
     def start(self):
@@ -40,7 +41,7 @@ class MadeUp:
         def advance(state):
             index = int(state["round"]) + 1
             self.before(index)
-            return state_after(index), stacked(self.setup.system, index, self.truths)
+            return state_after(index), stacked(self.setup.system, index, self.truths.at(index))
 
         return advance
 

@@ -113,7 +113,7 @@ def test_replayed_transitions_are_those_that_happened_and_are_paid_for_the_goal_
 
 
 def test_broken_episodes_are_kept_out():
-    learner, state, step = case(broken=0.9)
+    learner, state, step = case(broken=0.5)
     state, info = step(jax.random.key(1), state)
     assert info.nonfinite > 0
     assert info.skipped == 0
