@@ -65,7 +65,8 @@ def main() -> None:
         over = np.median(cost[name] / cost["informed"])
         print(f"| {name} | {_spread(cost[name])} | {_spread(late[name])} | {over:.2f} | {paper} |")
     for kind, values in (("episode", cost), ("second half", late)):
-        print(f"prior over first posterior, {kind}: {values['prior'].mean() / values['first'].mean():.2f}; paper 6.5")
+        ratio, error = _ratio(values["prior"], values["first"])
+        print(f"prior over first posterior, {kind}: {ratio:.2f} ± {error:.2f} (standard error); paper 6.5")
     error = np.stack([row["means"] for row in rows]) - np.asarray(TRUTH)
     print(f"posterior mean − θ*, mean ± sd over runs: first {_each(error[:, 0])}; second {_each(error[:, 1])}")
 
@@ -123,6 +124,12 @@ def _planning(args: argparse.Namespace) -> dict[str, Any]:
 
 def _spread(values: np.ndarray) -> str:
     return f"{values.mean():.4f} ± {values.std(ddof=1) if values.size > 1 else float('nan'):.4f}"
+
+
+def _ratio(above: np.ndarray, below: np.ndarray) -> tuple[float, float]:
+    """The ratio of means over runs, and its standard error to first order."""
+    ratio = float(above.mean() / below.mean())
+    return ratio, float((above - ratio * below).std(ddof=1) / below.mean() / np.sqrt(below.size))
 
 
 def _each(errors: np.ndarray) -> str:
