@@ -123,7 +123,7 @@ def draw_figure(rows: list[dict[str, Any]], path: Path) -> None:
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("ms for a control step")
     panels[0].text(SAMPLES[0], 54, "one control period", color="0.4", fontsize="small")
-    panels[0].legend(frameon=False, fontsize="small", loc="lower right")
+    panels[0].legend(frameon=False, fontsize="small", loc="upper left", bbox_to_anchor=(0.0, 0.78))
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)
     plt.close(figure)
