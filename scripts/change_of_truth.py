@@ -1,6 +1,6 @@
 """After θ* changes in mid-run: the cost of a step on the circle, round by round, beside that of who knows θ*.
 
-    python scripts/change_of_truth.py --runs 10 --out runs/change.jsonl
+    python scripts/change_of_truth.py --runs 8 --out runs/change.jsonl
 
 The robot drives rounds 1 to `--before` as it is, and from then on with worn wheels and its load at the other end. The
 loop forgets with probability `--forget`; planners of a round start from the same pose as the informed one.
@@ -32,7 +32,7 @@ FIRST, LATER = (0.0625, 0.475, 0.2), (0.045, 0.475, -0.2)
 def main() -> None:
     """Run what is asked for and print a line for each round."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=10)
+    parser.add_argument("--runs", type=int, default=8)
     parser.add_argument("--before", type=int, default=3, help="rounds before the change")
     parser.add_argument("--after", type=int, default=3, help="rounds after it")
     parser.add_argument("--forget", type=float, default=0.1)

@@ -1,6 +1,6 @@
 """The ways of planning with a belief, at equal numbers of simulated model steps.
 
-    python scripts/uses_of_theta.py --systems pendulum cartpole skid_steer --runs 20
+    python scripts/uses_of_theta.py --systems pendulum cartpole skid_steer --runs 12
 
 Every run hides its own θ*, drawn from the prior, in a simulated target, and drives one episode from the same start
 with each planner. Beliefs: `prior`, the uniform one; `posterior`, two components of a tenth of the prior's width, one
@@ -43,7 +43,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--systems", nargs="+", default=["pendulum", "cartpole", "skid_steer"])
     parser.add_argument("--beliefs", nargs="+", choices=("prior", "posterior"), default=["prior", "posterior"])
-    parser.add_argument("--runs", type=int, default=20)
+    parser.add_argument("--runs", type=int, default=12)
     parser.add_argument("--budget", type=int, default=512)
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
