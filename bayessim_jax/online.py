@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bayessim_jax.beliefs import Truncated
 from bayessim_jax.contracts import Estimator, GoalTask, Learner, Policy, Recording, Scalar, System, Target, Task
+from bayessim_jax.inference.encoders import features_of
 from bayessim_jax.inference.estimators import recurrent_mixture
 from bayessim_jax.inference.proposals import ProposalMode, lookup_proposal, pool_weights
 from bayessim_jax.learning.fixed import RecordedActions
@@ -121,7 +122,7 @@ class Setup:
             system=system,
             learner=learner,
             task=task,
-            estimator=recurrent_mixture() if estimator is None else estimator,
+            estimator=recurrent_mixture(features=features_of(system)) if estimator is None else estimator,
             proposal=lookup_proposal(proposal) if isinstance(proposal, str) else proposal,
             replay=replay,
             forget=forget,

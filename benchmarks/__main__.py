@@ -70,6 +70,8 @@ def main() -> None:
 
     mppi = commands.add_parser("mppi", help="a control step of DISCO on the pendulum against pytorch_mppi")
     mppi.add_argument("--repeats", type=int, default=7)
+    mppi.add_argument("--out", type=Path, help="file of JSON lines for what is timed; if it is there, it is printed")
+    mppi.add_argument("--figure", type=Path, help="of the time of a step over samples and horizon")
     _add_common(mppi)
 
     for command in (online, estimator, scaling, engines, fetch, mppi):

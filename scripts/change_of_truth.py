@@ -1,6 +1,6 @@
 """After θ* changes in mid-run: the cost of a step on the circle, round by round, beside that of who knows θ*.
 
-    python scripts/change_of_truth.py --runs 10 --out runs/change.jsonl
+    python scripts/change_of_truth.py --runs 8 --out runs/change.jsonl
 
 The robot drives rounds 1 to `--before` as it is, and from then on with worn wheels and its load at the other end. The
 loop forgets with probability `--forget`; planners of a round start from the same pose as the informed one.
@@ -32,7 +32,7 @@ FIRST, LATER = (0.0625, 0.475, 0.2), (0.045, 0.475, -0.2)
 def main() -> None:
     """Run what is asked for and print a line for each round."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=10)
+    parser.add_argument("--runs", type=int, default=8)
     parser.add_argument("--before", type=int, default=3, help="rounds before the change")
     parser.add_argument("--after", type=int, default=3, help="rounds after it")
     parser.add_argument("--forget", type=float, default=0.1)
@@ -47,24 +47,28 @@ def main() -> None:
         rows.append(result)
         print(f"{len(rows)}/{args.runs}: {result['seconds']:.0f} s", end="\r", flush=True)
     cost, informed = (np.stack([row[name] for row in rows]) for name in ("cost", "informed"))
-    print(f"mean cost of a step ± sd over {args.runs} runs; the belief is that after the round")
-    for k in range(cost.shape[1]):
-        when = "" if k < args.before else f", {k - args.before + 1} after the change"
-        ratio = cost[:, k] / informed[:, k]
-        print(
-            f"round {k + 1}{when}: {cost[:, k].mean():.4f} ± {cost[:, k].std():.4f}, informed "
-            f"{informed[:, k].mean():.4f} ± {informed[:, k].std():.4f}, ratio of means "
-            f"{cost[:, k].mean() / informed[:, k].mean():.2f}, within a fifth in {np.mean(ratio <= 1.2):.2f} of runs"
-        )
     stale = np.array([row["stale"] for row in rows])
-    print(f"with the belief from before the change: {stale.mean():.4f} ± {stale.std():.4f}")
+    print(
+        f"mean cost of a step ± sd over {args.runs} runs; the belief is that after the round; θ* changes after round "
+        f"{args.before}. With the belief from before the change: {stale.mean():.3g} ± {stale.std(ddof=1):.2g}"
+    )
+    print("| round | cost | informed | ratio of means | runs within a fifth |\n|---|---|---|---|---|")
+    for k in range(cost.shape[1]):
+        ratio, within = cost[:, k].mean() / informed[:, k].mean(), (cost[:, k] <= 1.2 * informed[:, k]).sum()
+        print(
+            f"| {k + 1} | {_spread(cost[:, k])} | {_spread(informed[:, k])} | {ratio:.2f} | {within} of {args.runs} |"
+        )
+
+
+def _spread(values: np.ndarray) -> str:
+    return f"{values.mean():.3g} ± {values.std(ddof=1):.2g}"
 
 
 def make_trial(args: argparse.Namespace) -> Callable[[int], dict[str, Any]]:
     """What one run gives, as a function of its number."""
     system, task = SkidSteer.create(), FollowCircle(steps=args.episode)
     planner = default_planner("mppi", "skid_steer", system, task)
-    sizes = {"steps": args.steps, "simulations": 400, "calibrations": 64, "history": 8}
+    sizes = {"steps": args.steps, "simulations": 400, "calibrations": 64, "history": 4}
     setup = online.Setup.create(system, planner, task, replay=True, forget=args.forget, **sizes)
     record, update = jax.jit(online.record), jax.jit(online.update, compiler_options=online.COMPILER_OPTIONS)
 

@@ -1,6 +1,6 @@
 """The ways of planning with a belief, at equal numbers of simulated model steps.
 
-    python scripts/uses_of_theta.py --systems pendulum cartpole skid_steer --runs 20
+    python scripts/uses_of_theta.py --systems pendulum cartpole skid_steer --runs 12
 
 Every run hides its own θ*, drawn from the prior, in a simulated target, and drives one episode from the same start
 with each planner. Beliefs: `prior`, the uniform one; `posterior`, two components of a tenth of the prior's width, one
@@ -43,26 +43,33 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--systems", nargs="+", default=["pendulum", "cartpole", "skid_steer"])
     parser.add_argument("--beliefs", nargs="+", choices=("prior", "posterior"), default=["prior", "posterior"])
-    parser.add_argument("--runs", type=int, default=20)
+    parser.add_argument("--runs", type=int, default=12)
     parser.add_argument("--budget", type=int, default=512)
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="file of JSON lines to append runs to, and to resume from")
     args = parser.parse_args()
     for name in args.systems:
-        for belief in args.beliefs:
-            labels = {"system": name, "belief": belief, "seed": args.seed, "budget": args.budget, "steps": args.steps}
-            make = _trial(name, belief, args)
-            rows = []
-            for result in resume(make, args.runs, args.out, labels):
-                rows.append(result)
-                print(f"{name} {belief} {len(rows)}/{args.runs}: {result['seconds']:.0f} s", end="\r", flush=True)
-            print(f"{name}, {belief}: mean cost of a step ± sd over {args.runs} runs of {args.steps} steps")
-            for way in (*WAYS, "informed"):
-                costs = np.array([row[way] for row in rows])
-                ratio = np.median(costs / np.array([row["informed"] for row in rows]))
-                spread = f"{costs.mean():8.4f} ± {costs.std(ddof=1):.4f}"
-                print(f"  {way:20s} {spread}; over the informed's, median {ratio:.2f}")
+        rows = {belief: _runs(name, belief, args) for belief in args.beliefs}
+        print(f"\n{name}: mean cost of a step ± sd over {args.runs} runs of {args.steps} steps, over the informed's")
+        print(f"| θ | {' | '.join(args.beliefs)} |\n|---{'|---' * len(rows)}|")
+        for way in (*WAYS, "informed"):
+            print(f"| {way} | {' | '.join(_cell(way, results) for results in rows.values())} |")
+
+
+def _runs(name: str, belief: str, args: argparse.Namespace) -> list[dict[str, Any]]:
+    labels = {"system": name, "belief": belief, "seed": args.seed, "budget": args.budget, "steps": args.steps}
+    rows = []
+    for result in resume(_trial(name, belief, args), args.runs, args.out, labels):
+        rows.append(result)
+        print(f"{name} {belief} {len(rows)}/{args.runs}: {result['seconds']:.0f} s", end="\r", flush=True)
+    return rows
+
+
+def _cell(way: str, rows: list[dict[str, Any]]) -> str:
+    """Mean ± sd of a way's cost, and the median of its ratio to the informed one's."""
+    costs, informed = (np.array([row[w] for row in rows]) for w in (way, "informed"))
+    return f"{costs.mean():.3g} ± {costs.std(ddof=1):.2g} (× {np.median(costs / informed):.2f})"
 
 
 def _trial(name: str, kind: str, args: argparse.Namespace) -> Callable[[int], dict[str, Any]]:

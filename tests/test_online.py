@@ -15,7 +15,7 @@ from bayessim_jax.inference.estimators import MixtureDensity
 from bayessim_jax.inference.proposals import Corrected
 from bayessim_jax.learning import Fixed, Ppo, RandomPolicy, RecordedActions, default_learner
 from bayessim_jax.rollout import rollout
-from bayessim_jax.systems import Balance, CartPole, Pendulum, Upswing, from_functions
+from bayessim_jax.systems import Balance, CartPole, Pendulum, SkidSteer, Upswing, from_functions
 
 TINY = MixtureDensity(Lstm(8, frame=4), MixtureHead(2, 8), Schedule(epochs=10, draws=32, batch=16), members=1, folds=4)
 
@@ -203,6 +203,14 @@ def test_wrong_shapes_and_sizes_are_told_in_one_line(cartpole):
 def test_the_default_estimator_is_the_recurrent_mixture(cartpole):
     setup, _ = cartpole
     assert online.Setup.create(setup.system, setup.learner).estimator == recurrent_mixture()
+
+
+def test_a_system_says_what_networks_read_of_it():
+    system = SkidSteer.create()
+    setup = online.Setup.create(system, Fixed(RandomPolicy(system.actions)), steps=7)
+    assert setup.estimator == recurrent_mixture(features=SkidSteer.features) != recurrent_mixture()
+    state = jax.eval_shape(lambda key: online.init(key, setup), jax.random.key(0))
+    assert state.estimator.feature_mean.shape == (3,)
 
 
 def test_a_wider_posterior_that_agrees_leaves_the_belief_and_one_that_disagrees_replaces_it(cartpole):

@@ -1,4 +1,4 @@
-"""The programs that reproduce the contact-rich experiments run from end to end at their smallest, and resume."""
+"""The programs that reproduce experiments run from end to end at their smallest, and resume."""
 
 import json
 import subprocess
@@ -35,3 +35,37 @@ def test_figure_two_runs_and_draws(tmp_path):
     assert [line["scheme"] for line in lines] == ["online", "offline", "uniform"]
     assert all(len(line["success"]) == 2 for line in lines)
     assert figure.stat().st_size > 1000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("script", "words"),
+    [
+        (
+            "reproduce_table2",
+            ["--samples", 32, "--steps", 20, "--episode", 20, "--simulations", 40, "--calibrations", 8],
+        ),
+        ("uses_of_theta", ["--systems", "pendulum", "--beliefs", "prior", "--budget", 32, "--steps", 5]),
+        ("change_of_truth", ["--before", 1, "--after", 1, "--steps", 20, "--episode", 20]),
+    ],
+)
+def test_experiments_with_planners_run_and_resume(script, words, tmp_path):
+    out = tmp_path / "t.jsonl"
+    said = run(f"{script}.py", *words, "--runs", 2, "--out", out)
+    assert len(out.read_text().splitlines()) == 2
+    assert run(f"{script}.py", *words, "--runs", 2, "--out", out).split("\r")[-1] == said.split("\r")[-1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", ["reproduce_table2", "uses_of_theta", "change_of_truth"])
+def test_the_tables_of_the_docs_are_printed_from_the_records(script):
+    """Nothing is simulated: the file of records stays as it is, and every row that is printed stands in the docs."""
+    name = script.removeprefix("reproduce_")
+    records = ROOT / "benchmarks" / "results" / f"{name}.jsonl"
+    before = records.read_bytes()
+    printed = run(f"{script}.py", "--out", records)
+    assert records.read_bytes() == before
+    docs = (ROOT / "docs" / "control.md").read_text()
+    rows = [line for line in printed.replace("\r", "\n").splitlines() if line.startswith("| ")]
+    assert len(rows) > 4
+    assert [row for row in rows if row not in docs] == []

@@ -20,6 +20,7 @@ from bayessim_jax.effects.vehicle import OnVehicle, SkidSteerVehicle
 from bayessim_jax.engines.gymnasium import GYMNASIUM, gymnasium_target
 from bayessim_jax.engines.rescored import Rescored
 from bayessim_jax.engines.simulated import SimulatedTarget
+from bayessim_jax.inference.encoders import features_of
 from bayessim_jax.inference.estimators import fourier_mixture, recurrent_mixture, summary_mixture
 from bayessim_jax.inference.fit import Schedule
 from bayessim_jax.recordings.truths import Truths
@@ -136,7 +137,7 @@ def _make_plan(settings: Settings) -> Plan:
         system,
         learner,
         task,
-        estimator=_estimator(settings, system.actions.size, Schedule(**pace)),
+        estimator=_estimator(settings, system, Schedule(**pace)),
         proposal=settings.proposal,
         replay=planned,
         forget=settings.forget,
@@ -177,12 +178,12 @@ def _target(settings: Settings, system: Any, task: Any, truth: Any, *, rescored:
     return kind, Rescored(target, system, task, truth) if rescored else target
 
 
-def _estimator(settings: Settings, actions: int, schedule: Schedule) -> Any:
+def _estimator(settings: Settings, system: Any, schedule: Schedule) -> Any:
     if settings.encoder == "fourier":
-        return fourier_mixture(actions=actions, components=settings.components, schedule=schedule)
+        return fourier_mixture(actions=system.actions.size, components=settings.components, schedule=schedule)
     if settings.encoder == "summary":
-        return summary_mixture(actions=actions, components=settings.components, schedule=schedule)
-    return recurrent_mixture(settings.encoder, settings.components, schedule)
+        return summary_mixture(actions=system.actions.size, components=settings.components, schedule=schedule)
+    return recurrent_mixture(settings.encoder, settings.components, schedule, features_of(system))
 
 
 def _truths(settings: Settings, box: Box, seeds: list[int]) -> Truths:

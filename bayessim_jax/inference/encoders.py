@@ -6,6 +6,7 @@ observations, their finite differences, the action, and whether the step happene
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import jax
@@ -16,7 +17,10 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from bayessim_jax.contracts import Recording
 from bayessim_jax.spelling import find_named
 
-__all__ = ["ENCODERS", "Encoder", "Lstm", "lookup_encoder", "transition_features"]
+__all__ = ["ENCODERS", "Encoder", "Features", "Lstm", "features_of", "lookup_encoder", "transition_features"]
+
+Features = Callable[[Recording], Float[Array, "steps features"]]
+"""What an encoder reads of every transition of a recording; zero where it did not happen."""
 
 
 class Encoder(Protocol):
@@ -41,6 +45,11 @@ def transition_features(recording: Recording) -> Float[Array, "steps features"]:
     now, later = recording.observations[:-1], recording.observations[1:]
     x = jnp.concatenate([now, later - now, recording.actions], axis=-1)
     return jnp.where(recording.valid[:, None], x, 0.0)
+
+
+def features_of(system: Any) -> Features:
+    """The system's own `features`, where it knows what of a transition depends on θ, or `transition_features`."""
+    return getattr(system, "features", transition_features)
 
 
 def pool(

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from bayessim_jax.beliefs import GaussianMixture
 from bayessim_jax.contracts import Box, Recording, Scalar
-from bayessim_jax.inference.encoders import Encoder, lookup_encoder, transition_features
+from bayessim_jax.inference.encoders import Encoder, Features, lookup_encoder, transition_features
 from bayessim_jax.inference.evidence import Recalibration, combine_evidence, credible_level, recalibrate
 from bayessim_jax.inference.fit import FitInfo, Schedule, fit
 from bayessim_jax.inference.heads import MixtureHead
@@ -80,6 +80,8 @@ class MixtureDensity:
     """Networks in the ensemble."""
     folds: int = struct.field(pytree_node=False, default=5)
     """Draws of θ are dealt to folds in turn; member m never trains on fold m."""
+    features: Features = struct.field(pytree_node=False, default=transition_features)
+    """What the encoder reads of a recording."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.members <= self.folds or self.folds < 2:
@@ -88,7 +90,7 @@ class MixtureDensity:
     def init(self, key: PRNGKeyArray, example: Recording, d: int) -> EstimatorState:
         """Random weights for sets of recordings shaped like `example` (leading axis: the set)."""
         steps = example.valid.shape[-1]
-        features = jax.eval_shape(jax.vmap(transition_features), example).shape[-1]
+        features = jax.eval_shape(jax.vmap(self.features), example).shape[-1]
 
         def member(key: PRNGKeyArray) -> dict[str, Any]:
             encoder_key, head_key = jax.random.split(key)
@@ -180,7 +182,7 @@ class MixtureDensity:
         return self.head.log_prob(params["head"], self.encoder.apply(params["encoder"], *inputs), z)
 
     def _inputs(self, state: EstimatorState, recordings: Recording) -> tuple[Array, Array]:
-        x = jax.vmap(jax.vmap(transition_features))(recordings)
+        x = jax.vmap(jax.vmap(self.features))(recordings)
         x = jnp.clip((x - state.feature_mean) / state.feature_scale, -10.0, 10.0)
         return jnp.where(recordings.valid[..., None], x, 0.0), recordings.valid
 
@@ -202,7 +204,7 @@ class MixtureDensity:
         return jax.tree.map(lambda a, b: jnp.where(use.sum() == 1, b, a), together, alone)
 
     def _set_units(self, state: EstimatorState, thetas: Array, recordings: Recording, weights: Array) -> EstimatorState:
-        x = jax.vmap(jax.vmap(transition_features))(recordings)
+        x = jax.vmap(jax.vmap(self.features))(recordings)
         w = weights[:, None, None, None] * recordings.valid[..., None]
         total = jnp.maximum(w.sum(), 1e-12)
         mean = (w * x).sum((0, 1, 2)) / total
@@ -239,14 +241,18 @@ def _judge(before: Float[Array, " n"], after: Float[Array, " n"], widen: Scalar)
 
 
 def recurrent_mixture(
-    encoder: str | Encoder = "pooled_lstm", components: int = 5, schedule: Schedule | None = None, **ensemble: int
+    encoder: str | Encoder = "pooled_lstm",
+    components: int = 5,
+    schedule: Schedule | None = None,
+    features: Features = transition_features,
+    **ensemble: int,
 ) -> MixtureDensity:
     """The paper's estimator: a recurrent encoder and a mixture of Gaussians, trained jointly.
 
     Source: Possas et al. 2020
     """
     encoder = lookup_encoder(encoder) if isinstance(encoder, str) else encoder
-    return MixtureDensity(encoder, MixtureHead(components), schedule or Schedule(), **ensemble)
+    return MixtureDensity(encoder, MixtureHead(components), schedule or Schedule(), features=features, **ensemble)
 
 
 def fourier_mixture(

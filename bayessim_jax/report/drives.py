@@ -110,7 +110,7 @@ def drive_animation(scene: Scene, caption: str) -> str:
         ("way so far", BLUE, 0.7, 1.5, way),
         ("vehicle", "", 1.0, 2.5, np.stack([_outline(*pose) for pose in scene.poses])),
     ]
-    return animation(scene.time, bodies, caption)
+    return animation(scene.time, bodies, caption, "The vehicle on its way, with the plans that it weighs.")
 
 
 def _joined(points: np.ndarray) -> np.ndarray:

@@ -175,7 +175,12 @@ def traces(
     )
 
 
-def animation(time: np.ndarray, bodies: Sequence[tuple[str, str, float, float, np.ndarray]], caption: str) -> str:
+def animation(
+    time: np.ndarray,
+    bodies: Sequence[tuple[str, str, float, float, np.ndarray]],
+    caption: str,
+    alt: str = "The model replaying the recording, with simulated ghosts.",
+) -> str:
     """Stick figures that move: for each a label, a colour, an opacity, a width and segments (frames, segments, 4)."""
     every = np.concatenate([b[-1].reshape(-1, 2) for b in bodies])
     every = every[np.isfinite(every).all(1)]
@@ -195,7 +200,7 @@ def animation(time: np.ndarray, bodies: Sequence[tuple[str, str, float, float, n
     return (
         '<figure class="wide animation"><p class="controls"><button type="button">Play</button> '
         f'<input type="range" min="0" value="0" aria-label="Time"> {keys}</p>\n'
-        '<canvas role="img" aria-label="The model replaying the recording, with simulated ghosts."></canvas>\n'
+        f'<canvas role="img" aria-label="{escape(alt)}"></canvas>\n'
         f'<script type="application/json">{_data(content)}</script>\n'
         f"<figcaption>{escape(caption)}</figcaption></figure>"
     )

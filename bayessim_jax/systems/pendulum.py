@@ -8,6 +8,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from bayessim_jax.contracts import Box, Discrete, Scalar
+from bayessim_jax.trigonometry import sincos
 
 __all__ = ["Pendulum", "PendulumState", "SwingUp", "Upswing"]
 
@@ -66,13 +67,15 @@ class Pendulum:
         """One semi-implicit Euler step."""
         length, mass = theta[0], theta[1]
         torque = jnp.clip(action[0], -2.0, 2.0)
-        acceleration = 3 * 10.0 / (2 * length) * jnp.sin(state.angle) + 3.0 / (mass * length**2) * torque
+        sine, _ = sincos(state.angle)
+        acceleration = 3 * 10.0 / (2 * length) * sine + 3.0 / (mass * length**2) * torque
         angle_dot = jnp.clip(state.angle_dot + acceleration * self.dt, -8.0, 8.0)
         return PendulumState(state.angle + angle_dot * self.dt, angle_dot)
 
     def observe(self, theta: Float[Array, " d"], state: PendulumState) -> Float[Array, " obs"]:
         """Cosine and sine of the angle, and the angular velocity."""
-        return jnp.stack([jnp.cos(state.angle), jnp.sin(state.angle), state.angle_dot])
+        sine, cosine = sincos(state.angle)
+        return jnp.stack([cosine, sine, state.angle_dot])
 
 
 @struct.dataclass
@@ -103,7 +106,8 @@ class Upswing:
 
     def reward(self, state: PendulumState, action: Float[Array, " act"], next_state: PendulumState) -> Scalar:
         """Minus the cost of the state that the action led to."""
-        return -(50.0 * (jnp.cos(next_state.angle) - 1.0) ** 2 + next_state.angle_dot**2)
+        _, cosine = sincos(next_state.angle)
+        return -(50.0 * (cosine - 1.0) ** 2 + next_state.angle_dot**2)
 
     def terminated(self, state: PendulumState) -> Bool[Array, ""]:
         """Never."""

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from bayessim_jax.contracts import Box, Discrete, Scalar
+from bayessim_jax.contracts import Box, Discrete, Recording, Scalar
 
 __all__ = ["FollowCircle", "SkidSteer", "SkidSteerState"]
 
@@ -99,6 +99,34 @@ class SkidSteer:
     def observe(self, theta: Float[Array, " d"], state: SkidSteerState) -> Float[Array, " obs"]:
         """The pose."""
         return jnp.stack([state.x, state.y, state.yaw])
+
+    @staticmethod
+    def features(recording: Recording) -> Float[Array, "steps features"]:
+        """What networks read at each step: log r, log d and x_ICR as least squares have them from the rows so far.
+
+        Where the robot was and which way it faced says nothing of θ. Ways are counted from the start of the recording,
+        so that wheels that are late do not look smaller or further apart:
+
+            s = r Σ (ω_R + ω_L) dt/2,   ψ = (r/d) Σ (ω_R − ω_L) dt,   l = −x_ICR ψ
+
+        with s and l the ways ahead and to the left, in the robot's own frame. Each ratio is held near zero until
+        there is something to tell.
+        """
+        poses, valid = recording.observations, recording.valid
+        x, y, turn = jnp.moveaxis(poses[1:] - poses[:-1], -1, 0)
+        yaw = (poses[1:, 2] + poses[:-1, 2]) / 2
+        cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+        left, right = recording.actions.T * (recording.times[1:] - recording.times[:-1])
+        moved = jnp.stack([cos * x + sin * y, cos * y - sin * x, turn, (left + right) / 2, right - left])
+        ahead, aside, around, rolled, twisted = jnp.cumsum(jnp.where(valid, moved, 0.0), axis=1)
+
+        def ratio(a: Float[Array, " steps"], b: Float[Array, " steps"], hold: float) -> Float[Array, " steps"]:
+            return jnp.cumsum(a * b) / (jnp.cumsum(b * b) + hold)
+
+        radius = 0.5 * jnp.log(ratio(ahead, rolled, 0.1) ** 2 + 1e-4)
+        gain = 0.5 * jnp.log(ratio(around, twisted, 0.1) ** 2 + 1e-4)
+        rows = jnp.stack([radius, radius - gain, -ratio(aside, around, 0.01)], axis=-1)
+        return jnp.where(valid[:, None], rows, 0.0)
 
 
 @struct.dataclass

@@ -1,11 +1,13 @@
 """The recordings of real rigs: every case is read, and what is told of it is what is known of the rig."""
 
+import json
 import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bayessim_jax.cli.main import main
 from bayessim_jax.recordings.loading import load_case
 
 ROOT = Path(__file__).parents[2]
@@ -68,3 +70,15 @@ def test_a_case_of_a_registered_system(name):
     assert stacked.sensors.shape[1:] == (21, 3)
     assert stacked.sensors_measured.all()
     assert len(stacked) == 60
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["warthog_asphalt", "warthog_ice"])
+def test_the_geometry_of_a_real_vehicle_predicts_windows_that_were_left_out(name, tmp_path):
+    """Slip and a late powertrain are not in the model, so what is found is a geometry that makes up for them."""
+    assert main(["infer", str(CASES / name), "--out", str(tmp_path / "run"), "--quiet"]) == 0
+    found = json.loads((tmp_path / "run" / "inference.json").read_text())
+    assert found["fit"]["held_out"]
+    assert found["fit"]["posterior"]["nrmse"] < 0.8 * found["fit"]["baseline"]["nrmse"]
+    assert set(found["parameters"]) == {"wheel_radius", "axial_distance", "icr_offset"}
+    assert found["parameters"]["axial_distance"]["mean"] > 1.4

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from bayessim_jax.contracts import Recording
 from bayessim_jax.systems import FollowCircle, SkidSteer
 
 ROBOT = SkidSteer.create(noise=0.0)
@@ -123,3 +124,17 @@ def test_the_cost_is_the_papers():
         state = ROBOT.restart(theta, jnp.array(pose))
         reward = task.reward(state, still, ROBOT.step(theta, state, still))
         assert reward == pytest.approx(-np.hypot(distance, 0.2), abs=1e-6)
+
+
+def test_features_are_theta_wherever_the_robot_is_and_whichever_way_it_faces():
+    """Without noise least squares find θ; they are zero where a transition did not happen."""
+    commands = np.array(jax.random.uniform(jax.random.key(2), (60, 2), minval=jnp.array([-8.0, -6.0]), maxval=14.0))
+    valid = jnp.arange(60) < 50
+    for theta in THETAS:
+        for start in ([0.0, 0.0, 0.0], [3.0, -1.0, 2.5]):
+            poses = jnp.asarray(drive(theta, start, commands))
+            times = 0.05 * jnp.arange(61)
+            rows = ROBOT.features(Recording(times, poses, commands, jnp.zeros(60), valid, jnp.array(False)))
+            found = np.concatenate([np.exp(rows[49, :2]), rows[49, 2:]])
+            np.testing.assert_allclose(found, theta, rtol=0.03, atol=0.003)
+            np.testing.assert_array_equal(rows[50:], 0.0)

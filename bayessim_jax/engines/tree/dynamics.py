@@ -26,7 +26,7 @@ from bayessim_jax.engines.tree.folding import (
     vector,
 )
 from bayessim_jax.engines.tree.links import Inertia, Link, symmetric
-from bayessim_jax.engines.tree.trigonometry import sincos
+from bayessim_jax.trigonometry import sincos
 
 __all__ = ["Pose", "bias_forces", "mass_matrix", "place_links"]
 
