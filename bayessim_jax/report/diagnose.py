@@ -134,7 +134,7 @@ def _scores(diagnosis: CaseDiagnosis) -> str:
 def _places(diagnosis: CaseDiagnosis) -> str:
     rows = []
     for place in diagnosis.locations:
-        when = "; ".join(f"{name} {number(a)} to {number(b)} s" for name, a, b in place.windows[:4])
+        when = "; ".join(f"{name} {number(a)} to {number(b)} s" for name, a, b in place.windows[:2])
         rows.append([place.at, f"{100 * place.share:.0f} %", place.regime, when])
     return html.table(["place", "share", "where in the state it is strong", "when, most of it first"], rows)
 
