@@ -20,7 +20,8 @@ usage: bayessim COMMAND [...]
 Bayesian inference of simulator parameters, composed with the learning of a controller.
 
 commands:
-  online SYSTEM   learn a system's parameters and its controller together (bayessim online --help)
+  online SYSTEM   learn a system's parameters and its controller together (bayessim online --help);
+                  online --from RUN trains on the simulator that a diagnosis repaired
   new CASE        make a case folder from a MuJoCo model (bayessim new --help)
   check CASE      print what a case holds and what is wrong with it
   infer CASE      infer a model's parameters from recordings (bayessim infer --help)

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-__all__ = ["Online", "Settings"]
+__all__ = ["DIAGNOSED", "HABITS", "Online", "Settings"]
 
 
 def _pairs(words: list[str]) -> dict[str, float]:
@@ -38,6 +38,18 @@ Pairs = Annotated[
         str_from_instance=lambda x: [f"{name}={value}" for name, value in x.items()],
     ),
 ]
+Run = Annotated[
+    str,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="RUN",
+        instance_from_str=lambda words: str(Path(words[0]).resolve()),
+        is_instance=lambda x: isinstance(x, str),
+        str_from_instance=lambda x: [x],
+    ),
+    tyro.conf.arg(name="from"),
+]
+"""A run folder, kept as an absolute path: a run is continued from anywhere."""
 COUNTS = ("rounds", "seeds", "steps", "recordings", "pool", "history", "calibrations", "components")
 LEAST = {
     **dict.fromkeys(COUNTS, 1),
@@ -49,12 +61,16 @@ LEAST = {
     "forget": 0.0,
 }
 FETCH = {"noise": 0.001, "warmup": 3, "evaluations": 10, "history": 8, "calibrations": 64}
+DIAGNOSED = "diagnosed"
+"""The system of a run that has its simulator from a diagnosis."""
 HABITS: dict[str, dict[str, Any]] = {
+    DIAGNOSED: {"scheme": "uniform", "noise": 0.0, "evaluations": 4, "history": 8, "calibrations": 64},
     "hopper": {"rounds": 50, "history": 8, "calibrations": 64},
     "fetch_push": FETCH,
     "fetch_slide": FETCH,
 }
-"""Defaults that differ where a system asks for it: simulations with contacts cost more, and Fetch is seen in metres."""
+"""Defaults that differ where a system asks for it: simulations with contacts cost more, and Fetch is seen in metres.
+What a diagnosis repaired is known already: domain randomization over its posterior, with the noise that it found."""
 
 
 @dataclass(frozen=True)
@@ -62,9 +78,14 @@ class Settings:
     """Everything that decides what a run computes; what `config.toml` holds."""
 
     system: tyro.conf.Positional[
-        Literal["cartpole", "pendulum", "acrobot", "skid_steer", "hopper", "fetch_push", "fetch_slide"]
+        Literal["cartpole", "pendulum", "acrobot", "skid_steer", "hopper", "fetch_push", "fetch_slide", "diagnosed"]
     ]
-    """What to identify and control; see `bayessim systems`."""
+    """What to identify and control; see `bayessim systems`. With --from it is left out."""
+    diagnosis: Run = ""
+    """Run folder of bayessim diagnose: train on the simulator that it repaired, over its posterior."""
+    goal: Pairs = field(default_factory=dict)
+    """With --from: the pose to bring joints to and hold, such as joint/elbow=1.0 (rad or m); joints that are not named
+    are held at the median of their recorded positions."""
     target: Literal["auto", "gymnasium", "simulated", "vehicle"] = "auto"
     """The machine with hidden parameters: Gymnasium's environment, this package's own system, or for skid_steer a
     vehicle with late wheels that slip; auto is Gymnasium's where there is one, and the package's own elsewhere."""
@@ -72,7 +93,8 @@ class Settings:
     """What acts: a policy that is trained, or a planner: mppi plans under the mean of the belief, disco under the
     belief; auto takes what suits the system."""
     truth: Pairs = field(default_factory=dict)
-    """True parameters to hide in the target; those not given are drawn from the prior by the seed."""
+    """True parameters to hide in the target; those not given are drawn from the prior by the seed, and with --from
+    they are the posterior's mean."""
     change: Pairs = field(default_factory=dict)
     """Other true parameters from a round on, such as round=10 length=0.8: what is not named stays as it was."""
     forget: float = 0.0
@@ -110,7 +132,8 @@ class Settings:
     components: int = 5
     """Gaussians in the posterior."""
     noise: float = 0.01
-    """Standard deviation of the sensor noise, in each channel's unit."""
+    """Standard deviation of the sensor noise, in each channel's unit; with --from it is added to what the diagnosis
+    found."""
     prior: tyro.conf.Suppress[dict[str, tuple[float, float]]] = field(default_factory=dict)
     schedule: tyro.conf.Suppress[dict[str, Any]] = field(default_factory=dict)
     learner: tyro.conf.Suppress[dict[str, Any]] = field(default_factory=dict)
@@ -149,7 +172,7 @@ class Online:
     """TOML file of settings, such as the config.toml of an earlier run; flags win over it. Its tables [prior],
     [schedule] and [learner] reach what has no flag."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Folder for the results; by default runs/SYSTEM-seedS."""
+    """Folder for the results; by default runs/SYSTEM-seedS; SYSTEM is the diagnosis' folder with --from."""
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
     """Continue the run in the output folder; more --rounds than before go on further."""
     quiet: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -158,4 +181,5 @@ class Online:
     @property
     def folder(self) -> Path:
         """Where the results go."""
-        return self.out or Path("runs") / f"{self.settings.system}-seed{self.settings.seed}"
+        name = Path(self.settings.diagnosis).name or self.settings.system
+        return self.out or Path("runs") / f"{name}-seed{self.settings.seed}"

@@ -55,8 +55,9 @@ def _flags(schema: Any) -> tuple[list[str], list[str]]:
             inner_flags, inner_hidden = _flags(hints[field.name])
             flags, hidden = flags + inner_flags, hidden + inner_hidden
         else:
-            suppressed = tyro.conf.Suppress in getattr(marked[field.name], "__metadata__", ())
-            (hidden if suppressed else flags).append("--" + field.name.replace("_", "-"))
+            marks = getattr(marked[field.name], "__metadata__", ())
+            name = next((name for mark in marks if (name := getattr(mark, "name", None))), field.name)
+            (hidden if tyro.conf.Suppress in marks else flags).append("--" + name.replace("_", "-"))
     return flags, hidden
 
 

@@ -6,15 +6,18 @@ import dataclasses
 import inspect
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from bayessim_jax import control, learning, online, systems
 from bayessim_jax.cli.citations import used_sources
 from bayessim_jax.cli.options import Settings
 from bayessim_jax.cli.parsing import UsageError
+from bayessim_jax.cli.subject import find_subject
 from bayessim_jax.contracts import Box
 from bayessim_jax.effects.vehicle import OnVehicle, SkidSteerVehicle
 from bayessim_jax.engines.gymnasium import GYMNASIUM, gymnasium_target
@@ -44,6 +47,8 @@ class Plan:
     target: Any
     seeds: list[int]
     truths: Truths
+    remarks: tuple[str, ...] = ()
+    """What a person should know before it starts."""
 
     @property
     def keys(self) -> jax.Array:
@@ -108,7 +113,9 @@ class Plan:
 
     def sources(self) -> list[str]:
         """What the run builds on, as authors and year."""
-        return used_sources([online.init, online.run, online.Truncated, self.setup])
+        system: Any = self.setup.system
+        effects = [type(w.effect) for w in getattr(getattr(system, "simulator", None), "effects", ())]
+        return used_sources([online.init, online.run, online.Truncated, self.setup, *effects])
 
 
 def make_plan(settings: Settings) -> Plan:
@@ -120,14 +127,16 @@ def make_plan(settings: Settings) -> Plan:
 
 
 def _make_plan(settings: Settings) -> Plan:
-    entry = systems.lookup(settings.system)
-    names = entry.system().parameters.names
+    subject = find_subject(settings)
+    entry, names = subject.entry, subject.box.names
     _check_names(settings.prior, names, "prior")
     system = entry.system(**settings.prior, noise=settings.noise)
     controller = entry.learner if settings.controller == "auto" else settings.controller
     planned = controller in control.PLANNERS
     if planned and entry.planned is None:
         raise ValueError(f"{settings.system} has no task that one can plan for; take --controller {entry.learner}.")
+    if planned:
+        _check_restart(system, controller, entry.learner)
     task = entry.planned() if planned and entry.planned else entry.task()
     box = system.parameters
     pace = dataclasses.asdict(Schedule()) | _checked(dataclasses.asdict(Schedule()), settings.schedule, "schedule")
@@ -146,17 +155,18 @@ def _make_plan(settings: Settings) -> Plan:
         **{name: getattr(settings, name) for name in sizes},
     )
     seeds = list(range(settings.seed, settings.seed + settings.seeds))
-    truths = _truths(settings, box, seeds)
+    truths = _truths(settings, box, seeds, subject.truth)
     kind, target = _target(settings, system, task, truths.at(1)[0], rescored=planned)
     complete = dataclasses.replace(
         settings,
         target=kind,
         controller=controller,
+        diagnosis=str(Path(settings.diagnosis).resolve()) if settings.diagnosis else "",
         prior={n: (_short(a), _short(b)) for n, a, b in zip(names, box.low, box.high, strict=True)},
         schedule=pace,
         learner={name: value for name, value in habits.items() if value is not None},
     )
-    return Plan(complete, setup, target, seeds, truths)
+    return Plan(complete, setup, target, seeds, truths, subject.remarks)
 
 
 def _target(settings: Settings, system: Any, task: Any, truth: Any, *, rescored: bool) -> tuple[Any, Any]:
@@ -186,8 +196,21 @@ def _estimator(settings: Settings, system: Any, schedule: Schedule) -> Any:
     return recurrent_mixture(settings.encoder, settings.components, schedule, features_of(system))
 
 
-def _truths(settings: Settings, box: Box, seeds: list[int]) -> Truths:
-    """The hidden parameters of every seed: those given, the others drawn from the prior; and what becomes of them."""
+def _check_restart(system: Any, controller: str, learner: str) -> None:
+    """Raise `ValueError` where a state cannot be made of what the sensors show."""
+    theta, seen = system.parameters.low, system.observations.low
+    try:
+        jax.eval_shape(system.restart, theta, seen)
+    except ValueError as error:
+        raise ValueError(
+            f"{controller} cannot plan: {str(error).rstrip('.')}; or take --controller {learner}."
+        ) from error
+
+
+def _truths(settings: Settings, box: Box, seeds: list[int], usual: Float[np.ndarray, " d"] | None) -> Truths:
+    """The hidden parameters of every seed: those given, the others as usual or drawn from the prior; and what becomes
+    of them.
+    """
     _check_names(settings.truth, box.names, "truth")
     changed = {name: value for name, value in settings.change.items() if name != "round"}
     _check_names(changed, box.names, "change")
@@ -208,6 +231,8 @@ def _truths(settings: Settings, box: Box, seeds: list[int]) -> Truths:
 
     keys = [jax.random.fold_in(jax.random.key(seed), TRUTH) for seed in seeds]
     drawn = np.stack([np.array(box.low + jax.random.uniform(key, (box.size,)) * box.width) for key in keys])
+    if usual is not None:
+        drawn[:] = np.clip(usual, box.low, box.high)
     first = placed(drawn, settings.truth, "truth")
     later = placed(first.copy(), changed, "change")
     return Truths(first, later, int(settings.change["round"]) if settings.change else None)

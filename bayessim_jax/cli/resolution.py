@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from bayessim_jax.cli.config_file import differing, read_settings, settings_from
-from bayessim_jax.cli.options import HABITS, Online, Settings
+from bayessim_jax.cli.options import DIAGNOSED, HABITS, Online, Settings
 from bayessim_jax.cli.parsing import UsageError, parse
 from bayessim_jax.recordings.run_folder import RunFolder
 
@@ -24,8 +24,9 @@ def read_command(words: Sequence[str]) -> Online:
     """The command with its settings complete but for what only the system knows; raises `UsageError`."""
     given = {word.split("=")[0] for word in words}
     elsewhere = "--config" in given or {"--resume", "--out"} <= given
-    command = _parse(words, {"system": "cartpole"} if elsewhere else {})
-    told = read_settings(command.config) if command.config else {}
+    own = {"system": DIAGNOSED} if "--from" in given else {}
+    command = _parse(words, own or ({"system": "cartpole"} if elsewhere else {}))
+    told = {**own, **(read_settings(command.config) if command.config else {})}
     if told or (elsewhere and not command.resume):
         command = _parse(words, told)
     habits = HABITS.get(command.settings.system, {})

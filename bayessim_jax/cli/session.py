@@ -27,7 +27,7 @@ from bayessim_jax.cli.report import read_run, write_report
 from bayessim_jax.cli.resolution import refuse_differences
 from bayessim_jax.recordings.journal import Journal
 from bayessim_jax.recordings.run_folder import RunFolder
-from bayessim_jax.report.words import headline, worries
+from bayessim_jax.report.words import headline, invocation, title, worries
 
 __all__ = ["Session"]
 
@@ -47,7 +47,7 @@ class Session:
     @property
     def continuation(self) -> str:
         """The command that continues this run."""
-        return f"bayessim online {self.plan.settings.system} --out {shlex.quote(str(self.folder.path))} --resume"
+        return f"{invocation(self.plan.settings.tables())} --out {shlex.quote(str(self.folder.path))} --resume"
 
     def run(self) -> int:
         """Run to the end, an interruption or a failure; returns the exit code."""
@@ -73,7 +73,7 @@ class Session:
     def _journal(self) -> Journal:
         plan = self.plan
         attributes = {
-            "title": f"Online BayesSim on {plan.settings.system}",
+            "title": title(plan.settings.tables()),
             "inference_library": "bayessim_jax",
             "inference_library_version": __version__,
         }
@@ -85,6 +85,8 @@ class Session:
         rounds, started = self.plan.settings.rounds, time.perf_counter()
         if self.resume:
             self._refuse_another(journal)
+        for remark in self.plan.remarks:
+            reporter.say(remark)
         reporter.stage("compiling; this is quick the next time")
         state, done = self.plan.start(), 0
         if self.resume:
@@ -148,6 +150,7 @@ class Session:
             **({"resumed": [*before.get("resumed", []), now]} if self.resume else {}),
             "ended": None,
             "seeds": plan.seeds,
+            **({"remarks": list(plan.remarks)} if plan.remarks else {}),
             "truth": truth,
             "device": {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count()},
             "versions": {

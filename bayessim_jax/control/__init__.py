@@ -62,8 +62,18 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "control_cost": 0.0,
         "noise": "spline",
     },
+    "diagnosed": {
+        "horizon": 40,
+        "samples": 256,
+        "sigma": 0.4,
+        "temperature": 1.0,
+        "share": 0.05,
+        "control_cost": 0.0,
+        "noise": "spline",
+    },
 }
-"""Settings of MPPI for each registered system that is planned for; particles share the samples among them.
+"""Settings of MPPI for each registered system that is planned for, and for what a diagnosis repaired; particles share
+the samples among them.
 
 The skid-steer robot has to turn on the spot before it can follow the circle from the wrong side of it: a plan of less
 than three seconds sees only that this costs more than to stand still.

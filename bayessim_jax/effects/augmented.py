@@ -18,7 +18,7 @@ from bayessim_jax.effects.drive import CAUTION, actuator_torque, actuators_of, p
 from bayessim_jax.effects.places import Site
 from bayessim_jax.effects.wiring import Wired, edit_model
 from bayessim_jax.engines.contract import Engine
-from bayessim_jax.systems.channels import Channel
+from bayessim_jax.systems.channels import Channel, state_columns
 from bayessim_jax.systems.mjcf import MjcfState, MjcfSystem
 
 __all__ = ["AugmentedMjcf", "AugmentedState", "Grip"]
@@ -139,6 +139,14 @@ class AugmentedMjcf:
             state = self._warm(theta, numbers, state, jnp.asarray(past, kind))
         commands, _ = self._commands(theta, numbers, state, first)
         return self._begin_joints(theta, numbers, inner, state, commands)
+
+    def restart(self, theta: Float[Array, " d"], observation: Float[Array, " obs"]) -> AugmentedState:
+        """The state that shows this observation, as if nothing had been commanded for long.
+
+        Raises `ValueError` where a position or velocity is not observed.
+        """
+        places, rates = (jnp.asarray(c) for c in state_columns(self.engine.model, self.channels))
+        return self.begin(theta, observation[places], observation[rates])
 
     def step(self, theta: Float[Array, " d"], state: AugmentedState, action: Float[Array, " act"]) -> AugmentedState:
         """Advance by one control period."""

@@ -39,9 +39,10 @@ DEFAULTS: dict[str, tuple[str, dict[str, Any]]] = {
     "hopper": ("ppo", {"episodes": 30, "episode_steps": 500, "gamma": 0.99}),
     "fetch_push": ("her", {}),
     "fetch_slide": ("her", {}),
+    "diagnosed": ("sac", {"episodes": 75, "episode_steps": 200}),
 }
-"""For each registered system: its learner, and the settings that learn its task in 15,000 policy steps a round.
-With Fetch a round is five epochs of a hundred episodes, 25,000 steps.
+"""For each registered system, and for what a diagnosis repaired: its learner, and the settings that learn its task in
+15,000 policy steps a round. With Fetch a round is five epochs of a hundred episodes, 25,000 steps.
 
 Episodes are as long as the task's: in the 50 steps of a recording a pole never meets the end of its track and an
 acrobot never reaches its line. The skid-steer robot is planned for by default: SAC learns here to stay near

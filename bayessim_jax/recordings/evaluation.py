@@ -26,7 +26,7 @@ from bayessim_jax.recordings.run_folder import RunFolder
 from bayessim_jax.recordings.shots import CaseModel, case_model
 from bayessim_jax.recordings.wording import CaseError
 
-__all__ = ["STATE", "evaluate_run", "simulator_of", "write_state"]
+__all__ = ["STATE", "evaluate_run", "read_table", "simulator_of", "write_state"]
 
 STATE = "simulators.json"
 FLEXIBLE = "flexible_force"
@@ -48,6 +48,9 @@ def write_state(folder: RunFolder, diagnosis: CaseDiagnosis) -> None:
             "values": list(own.values(candidate, x).values()),
             "spread": diagnosis.spreads[name].tolist(),
         }
+    noise = {"baseline": diagnosis.result.baseline, "augmented": diagnosis.result.best}
+    for name, entry in noise.items():
+        entries[name]["noise"] = entry.misfit.noise.tolist()
     state = {
         "schema": 1,
         "channels": list(bench.channels),
@@ -78,7 +81,7 @@ def evaluate_run(run: RunFolder, pattern: str) -> dict[str, Any]:
 
     Raises `ValueError` where a file cannot be read or no recording holds a window.
     """
-    state = _read_state(run.path / STATE)
+    state = read_table(run.path / STATE)
     case = load_case(Path(run.read_config()["case"])).check()
     case = with_recordings(case, pattern)
     model = case_model(case, refined=int(state["refined"]), before=BEFORE_ROWS)
@@ -129,12 +132,13 @@ def with_recordings(case: LoadedCase, pattern: str) -> LoadedCase:
     return dataclasses.replace(case, recordings=tuple(recordings))
 
 
-def _read_state(path: Path) -> dict[str, Any]:
+def read_table(path: Path) -> dict[str, Any]:
+    """A table that a diagnosis wrote; raises `ValueError` where the file is missing, damaged or of another schema."""
     try:
-        state = json.loads(path.read_text(encoding="utf-8"))
-        if state.get("schema") != 1:
+        table = json.loads(path.read_text(encoding="utf-8"))
+        if table.get("schema") != 1:
             raise ValueError("another schema")
-        return state
+        return table
     except (OSError, ValueError, AttributeError) as error:
         reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
         raise ValueError(f"{path} is missing or damaged ({reason}); run bayessim diagnose again.") from error

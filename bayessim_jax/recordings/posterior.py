@@ -47,7 +47,10 @@ def write_posterior(
 
     def named(x: np.ndarray, dims: tuple[str, ...], box: Box | Discrete, prefix: str = "") -> dict[str, Any]:
         units = zip(box.names, box.units, strict=True)
-        return {variable(prefix + name): (dims, x[..., i], {"units": unit}) for i, (name, unit) in enumerate(units)}
+        return {
+            variable(prefix + name): (dims, x[..., i], {"units": unit, "long_name": prefix + name})
+            for i, (name, unit) in enumerate(units)
+        }
 
     def marked(variables: dict[str, Any]) -> dict[str, Any]:
         low, high = np.asarray(parameters.low, float), np.asarray(parameters.high, float)
@@ -96,7 +99,7 @@ def read_draws(path: Path) -> Draws:
     known = all("truth" in mark for mark in marks)
     return Draws(
         draws=np.moveaxis(draws, 2, 1) if "seed" in data.dims else draws[:, None],
-        names=[str(name) for name in data.data_vars],
+        names=[str(v.attrs.get("long_name", name)) for name, v in data.data_vars.items()],
         units=[mark["units"] for mark in marks],
         low=np.array([mark["prior_low"] for mark in marks]),
         high=np.array([mark["prior_high"] for mark in marks]),

@@ -44,6 +44,11 @@ class OnlineRun:
         """The seeds, in the order of the arrays."""
         return list(dict.fromkeys(line["seed"] for line in self.lines))
 
+    @property
+    def inferred(self) -> bool:
+        """Whether any round inferred; where none did, the posterior of every round is the prior."""
+        return bool(np.isfinite(self.series("log_q_validation")).any())
+
     def series(self, name: str) -> Float[np.ndarray, "seed round"]:
         """One number of the metrics lines; NaN where it is null or absent."""
         place = {seed: i for i, seed in enumerate(self.seeds)}

@@ -14,7 +14,7 @@ from bayessim_jax.report.evidence import OnlineRun
 from bayessim_jax.report.pairs import pair_plot
 from bayessim_jax.report.trust import coverage_plot, rank_plot, truth_coverage_plot
 from bayessim_jax.report.viewer import SCRIPT_HASH, script
-from bayessim_jax.report.words import headline, number, plus_minus, worries
+from bayessim_jax.report.words import headline, invocation, number, plus_minus, title, worries
 
 __all__ = ["render"]
 
@@ -25,27 +25,27 @@ SEEDS_FOR_RANKS = 8
 
 def render(run: OnlineRun) -> str:
     """The whole page as text."""
-    system = str(run.settings.get("system", "a system"))
-    title = f"Online BayesSim on {system}"
+    name = title(run.settings)
     alarms = worries(run)
     good = "No sign of over-fitting, over-confidence or divergence was found in the last round."
     notices = [html.notice(text) for text in alarms] or [html.notice(good, good=True)]
     body = [
-        f"<h1>{html.escape(title)}</h1>",
+        f"<h1>{html.escape(name)}</h1>",
         f'<p class="soft">{html.escape(_circumstances(run))}</p>',
         f'<p class="lead">{html.escape(headline(run))}</p>',
+        *(f'<p class="soft">{html.escape(_sentence(text))}</p>' for text in run.facts.get("remarks", [])),
         *notices,
         *([html.section("Control", *_control(run))] if run.drives else []),
         html.section("Posterior", *_posterior(run)),
         html.section("Over rounds", *_over_rounds(run)),
-        html.section("Calibration", *_calibration(run)),
+        *([html.section("Calibration", *_calibration(run))] if run.inferred else []),
         html.section("What to do next", html.commands(_next(run, bool(alarms)))),
         html.section("Settings", _settings(run)),
         f"<footer>{html.escape(_origin(run))}</footer>",
     ]
     moving = run.scene is not None
     page = "\n".join(body)
-    return html.page(title, page, script=script(), script_hash=SCRIPT_HASH) if moving else html.page(title, page)
+    return html.page(name, page, script=script(), script_hash=SCRIPT_HASH) if moving else html.page(name, page)
 
 
 def _control(run: OnlineRun) -> list[str]:
@@ -80,13 +80,15 @@ def _posterior(run: OnlineRun) -> list[str]:
     figures = []
     common = (run.names, run.units, run.low, run.high)
     shown = SHOWN_OF_PLANNERS if run.drives else SHOWN
+    shown = shown if run.inferred else ()
     for index in sorted({r for r in shown if r <= run.rounds} | {run.rounds}):
         svg = pair_plot(run.draws[index - 1, 0], *common, run.truth_at(index), f"pair{index}")
         alt = f"Pair plot of the posterior after round {index}: {', '.join(run.names)}."
         figures.append(html.figure(svg, alt, f"Round {index}{which}. {marks}"))
-    svg = pair_plot(run.draws[-1, 0], *common, run.truth_at(run.rounds), "magnified", magnify=True)
-    alt = f"Pair plot of the posterior after round {run.rounds}, magnified."
-    figures.append(html.figure(svg, alt, f"Round {run.rounds}{which}, magnified to where the posterior lies."))
+    if run.inferred:
+        svg = pair_plot(run.draws[-1, 0], *common, run.truth_at(run.rounds), "magnified", magnify=True)
+        alt = f"Pair plot of the posterior after round {run.rounds}, magnified."
+        figures.append(html.figure(svg, alt, f"Round {run.rounds}{which}, magnified to where the posterior lies."))
     least = "24rem" if len(run.names) <= 2 else "34rem"
     return [html.figures(*figures, least=least), _parameter_table(run)]
 
@@ -181,9 +183,9 @@ def _calibration(run: OnlineRun) -> list[str]:
 
 
 def _next(run: OnlineRun, alarmed: bool) -> list[tuple[str, str]]:
-    system, out = str(run.settings.get("system")), str(run.facts.get("folder", "RUN"))
+    begin, out = invocation(run.settings), str(run.facts.get("folder", "RUN"))
     rounds, done = int(run.settings.get("rounds", run.rounds)), run.rounds
-    resume = f"bayessim online {system} --out {shlex.quote(out)} --resume"
+    resume = f"{begin} --out {shlex.quote(out)} --resume"
     steps = []
     if done < rounds:
         steps.append(("Finish this run:", resume))
@@ -191,9 +193,9 @@ def _next(run: OnlineRun, alarmed: bool) -> list[tuple[str, str]]:
         steps.append(("Go on for as many rounds again:", f"{resume} --rounds {2 * rounds}"))
     if alarmed:
         more = 2 * int(run.settings.get("simulations", 200))
-        steps.append(("Give the estimator more simulations a round:", f"bayessim online {system} --simulations {more}"))
+        steps.append(("Give the estimator more simulations a round:", f"{begin} --simulations {more}"))
     if len(run.seeds) == 1 and run.truths is not None:
-        steps.append(("See the spread over seeds, each with its own truth:", f"bayessim online {system} --seeds 8"))
+        steps.append(("See the spread over seeds, each with its own truth:", f"{begin} --seeds 8"))
     read = f"xarray.open_datatree({out + '/posterior.nc'!r})['posterior']"
     steps.append(("Use the posterior in Python:", f"import xarray\n{read}"))
     steps.append(("Look at every number as it changed:", f"tensorboard --logdir {shlex.quote(out + '/tensorboard')}"))
@@ -216,6 +218,10 @@ def _settings(run: OnlineRun) -> str:
     rows = []
     walk(facts, "")
     return shown + html.details("Versions, device and times", html.table(["fact", "value"], rows))
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}."
 
 
 def _circumstances(run: OnlineRun) -> str:

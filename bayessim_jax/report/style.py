@@ -64,5 +64,12 @@ def draw_svg(width: float, height: float, draw: Callable[[Figure], None], name: 
 
 
 def quantity(name: str, unit: str) -> str:
-    """The label of an axis: the quantity, and its unit in brackets where it has one."""
+    """The label of an axis: the quantity, and its unit in brackets where it has one.
+
+    The parameter of an effect takes a line each for effect, place and parameter.
+    """
+    effect, of_an_effect, rest = name.partition("@")
+    if of_an_effect:
+        place, _, parameter = rest.rpartition("/")
+        name = f"{effect}\n{place}\n{parameter}"
     return f"{name} [{unit}]" if unit else name

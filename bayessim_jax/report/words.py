@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import math
+import shlex
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bayessim_jax.report.evidence import OnlineRun
 
-__all__ = ["headline", "number", "plus_minus", "worries"]
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+__all__ = ["headline", "invocation", "number", "plus_minus", "title", "worries"]
 
 
 def number(value: float | np.floating, digits: int = 3) -> str:
@@ -30,10 +36,26 @@ def plus_minus(mean: float, sd: float, unit: str = "") -> str:
     return f"{mean:.{decimals}f} ± {sd:.{decimals}f}{tail}".replace("-", "−")
 
 
+def title(settings: Mapping[str, Any]) -> str:
+    """What the run is called."""
+    source = settings.get("diagnosis")
+    on = f"the simulator of {PurePath(source).name}" if source else settings.get("system", "a system")
+    return f"Online BayesSim on {on}"
+
+
+def invocation(settings: Mapping[str, Any]) -> str:
+    """The command that starts such a run, without its options."""
+    source = settings.get("diagnosis")
+    return f"bayessim online {f'--from {shlex.quote(source)}' if source else settings.get('system')}"
+
+
 def headline(run: OnlineRun) -> str:
     """The first sentences of the report."""
     start = f"After {_count(run.rounds, 'round')}"
     learned = _single(run) if len(run.seeds) == 1 else _several(run)
+    if not run.inferred:
+        seeds = f" and {len(run.seeds)} seeds" if len(run.seeds) > 1 else ""
+        learned = f"of domain randomization over {_join(list(run.names))}{seeds} nothing was inferred"
     returns = run.series("return_target")
     if not np.isfinite(returns).any():
         return f"{start} {learned}."

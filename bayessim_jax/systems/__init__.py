@@ -15,6 +15,7 @@ from bayessim_jax.systems.cartpole import Centre as Centre
 from bayessim_jax.systems.fetch import Fetch as Fetch
 from bayessim_jax.systems.fetch import MoveTo as MoveTo
 from bayessim_jax.systems.functional import from_functions as from_functions
+from bayessim_jax.systems.hold import Hold as Hold
 from bayessim_jax.systems.hopper import Hop as Hop
 from bayessim_jax.systems.hopper import Hopper as Hopper
 from bayessim_jax.systems.pendulum import Pendulum as Pendulum

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import mujoco
 
-__all__ = ["Channel", "find_channels", "observed_sensors"]
+__all__ = ["Channel", "find_channels", "observed_sensors", "state_columns"]
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,17 @@ def observed_sensors(model: mujoco.MjModel, channels: Sequence[Channel]) -> tupl
         for i in range(model.nsensor)
         if needed & set(range(model.sensor_adr[i], model.sensor_adr[i] + model.sensor_dim[i]))
     )
+
+
+def state_columns(model: mujoco.MjModel, channels: Sequence[Channel]) -> tuple[list[int], list[int]]:
+    """The channel that shows each entry of `qpos` and of `qvel`; raises `ValueError` where one is not observed."""
+    columns: dict[str, list[int]] = {"qpos": [], "qvel": []}
+    for wanted in find_channels(model):
+        showing = [k for k, c in enumerate(channels) if (c.source, c.index) == (wanted.source, wanted.index)]
+        if not showing:
+            raise ValueError(f"a state cannot be made of what is observed: {wanted.name} is missing; observe it.")
+        columns[wanted.source].append(showing[0])
+    return columns["qpos"], columns["qvel"]
 
 
 def _expand(model: mujoco.MjModel, name: str) -> list[Channel]:

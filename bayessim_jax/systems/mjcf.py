@@ -18,7 +18,7 @@ from bayessim_jax.contracts import Box
 from bayessim_jax.engines.choice import choose_engine
 from bayessim_jax.engines.contract import Engine
 from bayessim_jax.engines.fields import find_writes, merge_writes
-from bayessim_jax.systems.channels import Channel, find_channels, observed_sensors
+from bayessim_jax.systems.channels import Channel, find_channels, observed_sensors, state_columns
 
 __all__ = ["MjcfState", "MjcfSystem", "Unknown", "mjcf_system"]
 
@@ -76,6 +76,11 @@ class MjcfSystem:
     def begin(self, theta: Float[Array, " d"], qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]) -> MjcfState:
         """The state with these positions and velocities, without a control."""
         return MjcfState(self.engine.init(theta, qpos, qvel), jnp.zeros(self.actions.size))
+
+    def restart(self, theta: Float[Array, " d"], observation: Float[Array, " obs"]) -> MjcfState:
+        """The state that shows this observation; raises `ValueError` where a position or velocity is not observed."""
+        places, rates = (jnp.asarray(c) for c in state_columns(self.engine.model, self.channels))
+        return self.begin(theta, observation[places], observation[rates])
 
     def step(self, theta: Float[Array, " d"], state: MjcfState, action: Float[Array, " act"]) -> MjcfState:
         """Advance by one control period."""

@@ -8,7 +8,7 @@ import pytest
 
 from bayessim_jax import __version__
 from bayessim_jax.cli.main import main
-from bayessim_jax.cli.options import Online, Settings
+from bayessim_jax.cli.options import DIAGNOSED, Online, Settings
 from bayessim_jax.cli.parsing import UsageError, parse
 from bayessim_jax.cli.resolution import read_command
 
@@ -166,7 +166,7 @@ def test_the_choices_are_those_of_the_registries():
     from bayessim_jax.systems import SYSTEMS
 
     hints = typing.get_type_hints(Settings)
-    assert set(typing.get_args(hints["system"])) == set(SYSTEMS)
+    assert set(typing.get_args(hints["system"])) == {*SYSTEMS, DIAGNOSED}
     assert set(typing.get_args(hints["proposal"])) == set(PROPOSALS)
     assert set(typing.get_args(hints["encoder"])) == {*ENCODERS, "fourier", "summary"}
 

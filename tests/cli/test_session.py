@@ -27,6 +27,8 @@ SETTINGS = Settings("cartpole", rounds=4, seed=3, prior={"length": (0.1, 1.0), "
 class MadeUp:
     """A plan whose rounds cost nothing; `before` is called at the start of each."""
 
+    remarks = ()
+
     def __init__(self, rounds=4, seeds=1, before=lambda index: None):
         self.settings = replace(SETTINGS, rounds=rounds, seeds=seeds)
         self.setup = SimpleNamespace(system=CartPole.create())

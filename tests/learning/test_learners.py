@@ -220,7 +220,7 @@ def test_every_registered_system_has_its_learner(name):
     assert isinstance(learner, LEARNERS[DEFAULTS[name][0]])
     assert entry.learner in (DEFAULTS[name][0], *PLANNERS)
     assert learner.iterations * learner.envs * learner.horizon == (25_000 if entry.learner == "her" else 15_000)
-    assert set(DEFAULTS) == set(SYSTEMS)
+    assert set(DEFAULTS) == {*SYSTEMS, "diagnosed"}
 
 
 def test_default_learner_offers_the_near_miss():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from bayessim_jax.cli.main import main
+from bayessim_jax.recordings.repaired import load_repaired
 from benchmarks.worlds import make_case
 from tests.browser import CHROMIUM, open_in_chromium
 
@@ -75,6 +76,18 @@ def test_recordings_given_later_are_scored(friction, folder, capsys):
     assert main(["evaluate", str(folder), "--recordings", "x.csv"]) == 2
     told = capsys.readouterr().err.strip().splitlines()
     assert len(told) == 2 and "no file matches" in told[0]
+
+
+def test_the_repaired_simulator_is_there_to_train_on(friction):
+    run, table, _ = friction
+    repaired = load_repaired(run)
+    assert (repaired.verdict, repaired.effects) == ("explained", ("coulomb_friction@joint/hinge",))
+    found = [table["parameters"]["rod_mass"]["augmented"], table["effects"][0]["parameters"]["coulomb"]]
+    np.testing.assert_allclose(repaired.mean, [p["mean"] for p in found], rtol=1e-6)
+    np.testing.assert_allclose(repaired.sd, [p["sd"] for p in found], rtol=1e-6)
+    settings = json.loads((run / "simulators.json").read_text())
+    baseline = settings["simulators"]["baseline"]["noise"]
+    assert (repaired.noise > 0).all() and (repaired.noise <= 1.2 * np.array(baseline)).all()
 
 
 @pytest.mark.slow

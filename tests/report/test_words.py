@@ -76,3 +76,11 @@ def test_a_run_that_stopped_early_says_so():
     run = made_up(rounds=4, level_true=0.4, gain_over_prior=2.0)
     run.settings["rounds"] = 30
     assert worries(run) == ["The run stopped after 4 rounds of 30."]
+
+
+def test_a_run_that_never_inferred_claims_nothing():
+    told = headline(made_up(rounds=4, log_q_validation=None))
+    assert told.startswith(
+        "After 4 rounds of domain randomization over length and mass nothing was inferred. The policy"
+    )
+    assert "±" not in told
