@@ -101,6 +101,11 @@ class Bench:
         found, place = self.pairs[effect]
         return f"{found.name}@{at(place)}"
 
+    def label(self, effect: int) -> str:
+        """The same with what follows a `#`, which tells effects of one name at one place apart."""
+        found, place = self.pairs[effect]
+        return f"{found.name}@{place}"
+
     def names(self, candidate: Candidate) -> list[str]:
         """Of every effect of a candidate."""
         return [self.name(k) for k in candidate.effects]
@@ -177,7 +182,7 @@ class Bench:
             for i in range(self.first[k], self.first[k + 1]):
                 place = self.columns(candidate).index(i)
                 value = float(self.each[i].value(x[self.d + place]))
-                named[f"{self.name(k)}/{self.parameters[i].name}"] = value
+                named[f"{self.label(k)}/{self.parameters[i].name}"] = value
         return named
 
     def fit(

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from bayessim_jax.beliefs.margins import Margin
 from bayessim_jax.effects import Moment
+from bayessim_jax.inference.shooting import COMPILER_OPTIONS
 
 __all__ = ["Joint", "Kinds", "force_of", "restore_readings", "commands_of"]
 
@@ -48,7 +49,7 @@ def _values(kinds: Kinds, x: Array, low: Array, high: Array) -> dict[str, Array]
     }
 
 
-@partial(jax.jit, static_argnames=("effect", "kinds", "detail", "h", "steps"))
+@partial(jax.jit, static_argnames=("effect", "kinds", "detail", "h", "steps"), compiler_options=COMPILER_OPTIONS)
 def force_of(
     effect: Any,
     kinds: Kinds,
@@ -86,7 +87,7 @@ def force_of(
     return _with_slopes(force, x)
 
 
-@partial(jax.jit, static_argnames=("effect", "kinds", "h", "steps", "before"))
+@partial(jax.jit, static_argnames=("effect", "kinds", "h", "steps", "before"), compiler_options=COMPILER_OPTIONS)
 def commands_of(
     effect: Any,
     kinds: Kinds,
@@ -134,7 +135,7 @@ def commands_of(
     return _with_slopes(change, x)
 
 
-@partial(jax.jit, static_argnames=("effect", "kinds", "period"))
+@partial(jax.jit, static_argnames=("effect", "kinds", "period"), compiler_options=COMPILER_OPTIONS)
 def restore_readings(
     effect: Any,
     kinds: Kinds,

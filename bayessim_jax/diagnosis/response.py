@@ -212,6 +212,7 @@ def _normal(r: Array, slopes: Array, p: Array, scaled: Array) -> Curvature:
         own=products[:, k:, k:] + jnp.eye(n),
         cross=products[:, k:, :k],
         own_gradient=pulls[:, k:] - scaled,
+        pulls=pulls[:, :k],
     )
 
 

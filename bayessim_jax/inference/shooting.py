@@ -36,6 +36,7 @@ __all__ = [
     "profile",
     "residuals",
     "ridge",
+    "robust_covariance",
     "solve",
 ]
 
@@ -73,6 +74,8 @@ class Curvature:
     """Of every δ_w, with its prior."""
     cross: Float[Array, "windows n d"]
     own_gradient: Float[Array, "windows n"]
+    pulls: Float[Array, "windows d"]
+    """Every window's part of the gradient of z."""
 
 
 @struct.dataclass
@@ -85,6 +88,8 @@ class Fit:
     """Noise, in each channel's unit."""
     precision: Float[Array, "d d"]
     """Of z with every δ eliminated: the inverse of Laplace's covariance."""
+    pulls: Float[Array, "windows d"]
+    """Every window's part of the gradient of z, its δ eliminated."""
     cost: Scalar
     steps: Int[Array, ""]
     converged: Bool[Array, ""]
@@ -139,6 +144,7 @@ def linearize(predict: Predict, shots: Shots, z: Array, delta: Array, sigma: Arr
         own=products[:, d:, d:] + jnp.eye(n),
         cross=products[:, d:, :d],
         own_gradient=pulls[:, d:] - scaled,
+        pulls=pulls[:, :d],
     )
 
 
@@ -153,8 +159,8 @@ def eliminate(c: Curvature, damping: Scalar | float = 0.0) -> tuple[Array, Array
     return precision, gradient, toward, shift
 
 
-COMPILER_OPTIONS = {"xla_cpu_use_fusion_emitters": False} if jax.default_backend() == "cpu" else {}
-"""Compilation takes half as long, and what comes out is no slower."""
+COMPILER_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
+"""For programs of small arrays on a CPU: compilation takes half as long, and what comes out is no slower."""
 
 
 @partial(jax.jit, static_argnames=("predict", "step"), compiler_options=COMPILER_OPTIONS)
@@ -189,6 +195,7 @@ def solve(
         own=jnp.zeros((windows, n, n), kind),
         cross=jnp.zeros((windows, n, d), kind),
         own_gradient=jnp.zeros((windows, n), kind),
+        pulls=jnp.zeros((windows, d), kind),
     )
 
     def body(carry: Any) -> Any:
@@ -214,15 +221,31 @@ def solve(
 
     start = ((z, delta), (z, delta), nothing, jnp.asarray(damping, kind), jnp.array(0), jnp.array(0))
     _, (z, delta), here, last, count, small = jax.lax.while_loop(more, body, start)
+    precision, _, _, shift = eliminate(here)
     return Fit(
         z=z,
         delta=delta,
         sigma=sigma,
-        precision=jnp.where(held, eliminate(here)[0], jnp.eye(d)),
+        precision=jnp.where(held, precision, jnp.eye(d)),
+        pulls=jnp.where(free, here.pulls - jnp.einsum("wni,wn->wi", here.cross, shift), 0.0),
         cost=here.cost,
         steps=count,
         converged=(small >= 2) | (last >= 1e9),
     )
+
+
+def robust_covariance(fit: Fit) -> Float[Array, "d d"]:
+    """Covariance of z where the model is only nearly right: Laplace's, wider where windows disagree more than noise.
+
+    With H⁻¹ = L Lᵀ the windows' gradients g have Σ Lᵀ g gᵀ L = I on average if the model is right. Where an eigenvalue
+    of it is larger, the covariance is larger by as much (the sandwich H⁻¹ Σ g gᵀ H⁻¹); it is never smaller.
+
+    Source: White 1982
+    """
+    root = jnp.linalg.inv(jnp.linalg.cholesky(fit.precision)).T
+    values, axes = jnp.linalg.eigh(jnp.einsum("wi,wj->ij", fit.pulls @ root, fit.pulls @ root))
+    wide = root @ (axes * jnp.sqrt(jnp.maximum(values, 1.0)))
+    return wide @ wide.T
 
 
 @struct.dataclass

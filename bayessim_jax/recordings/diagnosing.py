@@ -22,7 +22,7 @@ from bayessim_jax.diagnosis.screen import Screened
 from bayessim_jax.diagnosis.verdict import Diagnosis, Entry, Thresholds, share_left
 from bayessim_jax.effects import EFFECTS, Scales, effect_places, recorded_scales
 from bayessim_jax.inference.scores import Score, compare, error_spread, score
-from bayessim_jax.inference.shooting import Shots
+from bayessim_jax.inference.shooting import Shots, robust_covariance
 from bayessim_jax.recordings.experiments import advise, next_experiment
 from bayessim_jax.recordings.identification import Settled, channel_scale, settle_step, start_spread
 from bayessim_jax.recordings.shots import CaseModel, split_windows, take
@@ -127,22 +127,19 @@ class CaseDiagnosis:
 
     def _effects(self, entry: Entry) -> list[dict[str, Any]]:
         means, sds = moments(self.bench, entry)
-        units = {
-            f"{self.bench.name(k)}/{p.name}": p.unit
-            for k in entry.candidate.effects
-            for p in self.bench.parameters[self.bench.first[k] : self.bench.first[k + 1]]
-        }
         found = []
-        for name in entry.names:
-            effect, _, place = name.partition("@")
-            own = {key: key.rpartition("/")[2] for key in means if key.startswith(name + "/")}
+        for k in entry.candidate.effects:
+            effect, _, place = self.bench.name(k).partition("@")
+            own = self.bench.parameters[self.bench.first[k] : self.bench.first[k + 1]]
+            keys = [f"{self.bench.label(k)}/{p.name}" for p in own]
             found.append(
                 {
                     "effect": effect,
                     "at": place,
                     "probability": self.result.probabilities[0],
                     "parameters": {
-                        short: {"mean": means[key], "sd": sds[key], "unit": units[key]} for key, short in own.items()
+                        p.name: {"mean": means[key], "sd": sds[key], "unit": p.unit}
+                        for key, p in zip(keys, own, strict=True)
                     },
                 }
             )
@@ -150,9 +147,9 @@ class CaseDiagnosis:
 
 
 def moments(bench: Bench, entry: Entry) -> tuple[dict[str, float], dict[str, float]]:
-    """Means and standard deviations of a candidate's effects, by Laplace."""
+    """Means and standard deviations of a candidate's effects."""
     means = bench.values(entry.candidate, entry.fit.z)
-    covariance = np.linalg.inv(np.asarray(entry.fit.precision))
+    covariance = np.asarray(robust_covariance(entry.fit))
     sds = {}
     for j, (key, column) in enumerate(zip(means, bench.columns(entry.candidate), strict=True)):
         x = entry.fit.z[bench.d + j]
@@ -162,9 +159,9 @@ def moments(bench: Bench, entry: Entry) -> tuple[dict[str, float], dict[str, flo
 
 
 def _theta(bench: Bench, entry: Entry) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation of the system's own parameters, by Laplace."""
+    """Mean and standard deviation of the system's own parameters."""
     d = bench.d
-    covariance = np.linalg.inv(np.asarray(entry.fit.precision))[:d, :d]
+    covariance = np.asarray(robust_covariance(entry.fit))[:d, :d]
     slopes = np.asarray(jax.jacfwd(bench.margins.theta)(entry.fit.z[:d]))
     return np.asarray(bench.margins.theta(entry.fit.z[:d])), np.sqrt(np.diag(slopes @ covariance @ slopes.T))
 

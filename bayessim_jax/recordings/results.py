@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from bayessim_jax import __version__
 from bayessim_jax.effects import write_mjcf
+from bayessim_jax.inference.shooting import robust_covariance
 from bayessim_jax.recordings.evaluation import write_state
 from bayessim_jax.recordings.experiments import write_experiment
 from bayessim_jax.recordings.files import replace_file, to_json, write_text
@@ -101,7 +102,7 @@ def _write_laplace(path: Path, diagnosis: CaseDiagnosis, seed: int) -> None:
     rng = np.random.default_rng(seed)
     columns = bench.columns(entry.candidate)
     size = bench.d + len(columns)
-    covariance = np.linalg.inv(np.asarray(entry.fit.precision)[:size, :size])
+    covariance = np.asarray(robust_covariance(entry.fit))[:size, :size]
     z = rng.multivariate_normal(np.asarray(entry.fit.z)[:size], covariance, PRIOR_DRAWS)
     names = [*margins.names, *(variable(name) for name in bench.values(entry.candidate, entry.fit.z))]
     units = [*margins.units, *(bench.parameters[i].unit for i in columns)]

@@ -33,7 +33,7 @@ def rig(tmp_path_factory):
 def member(bench, k):
     x = bench.starts(Candidate((k,)), jnp.array([0.0]))[1]
     delta = jnp.zeros((bench.shots.y.shape[0], 2))
-    fit = Fit(x, delta, jnp.array([0.01, 0.1]), 1e4 * jnp.eye(x.size), jnp.zeros(()), jnp.zeros(()), jnp.array(True))
+    fit = Fit(x, delta, jnp.array([0.01, 0.1]), 1e4 * jnp.eye(x.size), 0.0 * x[None], 0.0, 0, True)
     return Entry(Candidate((k,)), bench.names(Candidate((k,))), fit, np.zeros(1), None)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from bayessim_jax.beliefs.margins import Margins, normal
 from bayessim_jax.inference.direct import fit_direct, noise_floor, sample_direct
-from bayessim_jax.inference.shooting import Shots, eliminate, linearize, profile, ridge, solve
+from bayessim_jax.inference.shooting import Shots, eliminate, linearize, profile, ridge, robust_covariance, solve
 
 WINDOWS, ROWS = 6, 12
 SIGMA = 0.3
@@ -151,3 +151,24 @@ def test_the_floor_of_the_noise_is_what_the_sensor_resolves():
     values = np.round(np.random.default_rng(0).normal(size=(4, ROWS, 1)), 1)
     shots = Shots(jnp.zeros(4), jnp.asarray(values), jnp.ones(values.shape, bool), jnp.ones(1))
     assert 1e-4 <= float(noise_floor(shots)[0]) <= 0.1 / np.sqrt(12) + 1e-9
+
+
+@pytest.mark.parametrize("wrong", [0.0, 2.0])
+def test_windows_that_disagree_widen_the_covariance(wrong):
+    """Every window has a slope of its own, which the model knows nothing of; without, Laplace's covariance is right."""
+    rng, windows, off, laplace, robust = np.random.default_rng(0), 60, [], [], []
+    t = np.linspace(0.0, 1.0, ROWS)
+    for _ in range(60):
+        y = 0.7 * t + 0.4 * t**2 + wrong * rng.normal(size=(windows, 1)) * t + SIGMA * rng.normal(size=(windows, ROWS))
+        shots = Shots(
+            jnp.zeros(windows), jnp.asarray(y[..., None]), jnp.ones((windows, ROWS, 1), bool), jnp.array([0.5])
+        )
+        zero = (jnp.zeros(2), jnp.zeros((windows, 1)), jnp.array([SIGMA]), jnp.ones(2, bool))
+        fit = solve(line, shots, *zero)
+        off.append(np.asarray(fit.z) - [0.7, 0.4])
+        laplace.append(np.linalg.inv(fit.precision))
+        robust.append(np.asarray(robust_covariance(fit)))
+    spread = np.cov(np.array(off).T)
+    sds = [np.sqrt(np.diag(np.mean(c, 0)) / np.diag(spread)) for c in (laplace, robust)]
+    np.testing.assert_allclose(sds[1], 1.0, atol=0.3)
+    assert (sds[0][0] < 0.6) == (wrong > 0)
