@@ -25,7 +25,7 @@ from bayessim_jax.inference.replay import Inputs, replay_window
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Fit, Shots, expand, solve
 from bayessim_jax.systems.mjcf import MjcfSystem
 
-__all__ = ["SLOTS", "Bench", "Candidate"]
+__all__ = ["NEAR", "SLOTS", "Bench", "Candidate", "moves"]
 
 NEAR = 0.1
 """Of the way from an effect's neutral value to where a fit usually begins: weak effects are found from there."""
@@ -148,7 +148,7 @@ class Bench:
             return np.array([float(self.each[i].standard(jnp.asarray(v, float))) for i, v in pairs])
 
         begin = standard([p.start for p in own])
-        near = standard([p.neutral + NEAR * (p.start - p.neutral) if _moves(p) else p.start for p in own])
+        near = standard([p.neutral + NEAR * (p.start - p.neutral) if moves(p) else p.start for p in own])
         points = [near, begin] if len(own) and np.abs(near - begin).max() > 1e-9 else [begin]
         points += [-begin] if any(p.low < 0.0 for p in own) else []
         rest = np.zeros(self.slots - len(columns))
@@ -214,7 +214,7 @@ class Bench:
         return _look(self.predict, shots, fit.z, fit.delta, self.step)
 
 
-def _moves(p: EffectParameter) -> bool:
+def moves(p: EffectParameter) -> bool:
     """Whether an effect grows from its neutral value along a parameter."""
     return np.isfinite(p.neutral) and p.low <= p.neutral <= p.high and not p.log
 

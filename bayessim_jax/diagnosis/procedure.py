@@ -17,7 +17,7 @@ from bayessim_jax.diagnosis.bench import SLOTS, Bench, Candidate
 from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.diagnosis.scene import Scene
 from bayessim_jax.diagnosis.screen import Screen, Screened
-from bayessim_jax.diagnosis.verdict import Diagnosis, Entry, Thresholds, are_kin, decide, share_left
+from bayessim_jax.diagnosis.verdict import Diagnosis, Entry, Thresholds, are_kin, decide, error_left, share_left
 from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, judge_misfit
 from bayessim_jax.effects import Scales
 from bayessim_jax.inference.direct import noise_floor
@@ -98,6 +98,8 @@ class Problem:
     motion: Motion
     """The smoothed motion in the same windows."""
     step: float = 0.0
+    ahead: Shots | None = None
+    """Windows as long as predictions are to be, to which nothing is fitted."""
 
     def screen(self, pairs: Sequence[tuple[Any, str]], slots: int = SLOTS) -> Screen:
         """Pairs to be held against some of the windows."""
@@ -161,7 +163,7 @@ def name_effects(
     singles = _finalists(screen, nothing, ranked)
     work = _bench_of(key, problem, singles, say)
     none = _without(work, problem, detected)
-    entries = _finish(work, none, singles)
+    entries = _finish(work, none, singles, problem.ahead)
     left = share_left(entries[0].misfit, none.misfit) if entries else 1.0
     if left > thresholds.enough:
         say("one effect is not enough: trying pairs")
@@ -175,7 +177,7 @@ def name_effects(
             kept = [*pairs, *(found for found in ranked if found.candidate.effects[0] in alone | best)]
             work = _bench_of(key, problem, kept, say)
             none = _without(work, problem, detected)
-            entries = _finish(work, none, kept)
+            entries = _finish(work, none, kept, problem.ahead)
     return decide(work.bench, none, entries, work.group, thresholds, listed)
 
 
@@ -263,9 +265,10 @@ def _without(work: _Work, problem: Problem, detected: Entry) -> Entry:
     return entry
 
 
-def _finish(work: _Work, none: Entry, candidates: Sequence[Screened]) -> list[Entry]:
+def _finish(work: _Work, none: Entry, candidates: Sequence[Screened], ahead: Shots | None) -> list[Entry]:
     """Candidates simulated and fitted from where the screen found them, and scored across recordings, best first."""
     entries, bench = [], work.bench
+    base = None if ahead is None else bench.replay(Candidate(), none.fit.z, ahead)
     every = np.ones(len(work.group), bool)
     for found in candidates:
         own = Candidate(tuple(work.numbers.index(k) for k in found.candidate.effects))
@@ -273,6 +276,8 @@ def _finish(work: _Work, none: Entry, candidates: Sequence[Screened]) -> list[En
         fit = bench.fit(own, found.p, delta, sigma, work.mask(), steps=12)
         if np.isfinite(float(fit.cost)):
             entry = _enter(work, own, work.settle(own, fit, every))
+            if ahead is not None and base is not None:
+                entry.ahead = error_left(ahead, bench.replay(own, fit.z, ahead), base, entry.misfit.noise)
             entry.scores = np.logaddexp(np.log1p(-DOUBT) + entry.scores, np.log(DOUBT) + none.scores)
             entries.append(entry)
             work.say(f"{' + '.join(entry.names)}: score {entry.score:.1f}")

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from bayessim_jax.diagnosis.bench import Candidate
+from bayessim_jax.diagnosis.bench import NEAR, Candidate, moves
 from bayessim_jax.diagnosis.response import cross_validate, propose
 from bayessim_jax.diagnosis.scene import Scene
 from bayessim_jax.diagnosis.whiteness import Misfit, judge_misfit
@@ -26,6 +26,8 @@ __all__ = ["Begun", "Screen", "Screened"]
 ITERATIONS = 6
 BEGINNING, KEPT, LASTING = 8, 2, 8
 """Steps of the solver from every point that a candidate is begun from, how many go on, and their further steps."""
+GLANCING = 6
+"""Steps of the solver from each of two points, by which partners of a known effect are ranked."""
 MOMENTS, CLOCK = 8, 2.0
 """Times that are tried for what happens at some time; a parameter in s that may be so many windows long is a time."""
 DRAWS = 3
@@ -184,14 +186,19 @@ class Screen:
         return judge_misfit(key, residual, unscaled.reshape(len(slopes), n, -1), np.asarray(self.shots.measured))
 
     def glance(self, candidate: Candidate, known: Screened) -> float:
-        """The cost of a candidate after a first step from a fit of a part of it."""
+        """The cost of a candidate after a few steps from a fit of a part of it, what is added nearly neutral or not."""
         held = dict(self.offsets(known.candidate))
         added = Candidate(tuple(k for k in candidate.effects if k not in held))
-        start = self.starts(added, np.random.default_rng(0))[0]
         own = dict(self.offsets(added))
-        p = self._put(candidate, known, held, own, start)
-        found = self.fit(candidate, p, known.delta, known.sigma, 2)
-        return float("inf") if found[2] is None else float(found[2].cost)
+        each = [q for k in added.effects for q in zip(self.scene.parameters[k], self.scene.margin[k], strict=True)]
+        costs = []
+        for share in (NEAR, 1.0):
+            values = [p.neutral + share * (p.start - p.neutral) if moves(p) else p.start for p, _ in each]
+            start = [float(m.standard(jnp.asarray(v, float))) for v, (_, m) in zip(values, each, strict=True)]
+            p = self._put(candidate, known, held, own, np.array(start))
+            found = self.fit(candidate, p, known.delta, known.sigma, GLANCING)
+            costs.append(np.inf if found[2] is None else float(found[2].cost))
+        return min(costs)
 
     def _put(
         self,

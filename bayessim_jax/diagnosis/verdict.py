@@ -10,9 +10,9 @@ from jaxtyping import Float, Int
 
 from bayessim_jax.diagnosis.bench import Bench, Candidate
 from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, Misfit
-from bayessim_jax.inference.shooting import Fit
+from bayessim_jax.inference.shooting import Fit, Shots
 
-__all__ = ["CONTAINS", "Diagnosis", "Entry", "Thresholds", "are_kin", "decide", "share_left"]
+__all__ = ["CONTAINS", "Diagnosis", "Entry", "Thresholds", "are_kin", "decide", "error_left", "share_left"]
 
 CONTAINS = {
     "stribeck_friction": ("coulomb_friction",),
@@ -58,6 +58,8 @@ class Entry:
     scores: Float[np.ndarray, " windows"]
     """Log predictive density of every window, its initial state profiled out."""
     misfit: Misfit
+    ahead: float = 1.0
+    """Share of the baseline's error that predictions as long as the horizon still have beyond the noise."""
 
     @property
     def score(self) -> float:
@@ -92,6 +94,26 @@ def share_left(after: Misfit, before: Misfit) -> float:
     noise = np.minimum(after.noise, before.noise)
     own, was = ((m.excess * (m.noise / noise) ** 2).sum() for m in (after, before))
     return float(max(own, 0.0) / max(was, 1e-12))
+
+
+def error_left(
+    shots: Shots,
+    predicted: Float[np.ndarray, "windows rows obs"],
+    base: Float[np.ndarray, "windows rows obs"],
+    noise: Float[np.ndarray, " obs"],
+) -> float:
+    """Share of the error of one prediction of windows, beyond the noise, that another one still has.
+
+    A window in which it errs more, because motion there is chaotic, counts as not improved.
+    """
+    measured, y = np.asarray(shots.measured), np.asarray(shots.y)
+    large = 1e6
+    own, was = (
+        np.where(measured, np.nan_to_num(((y - p) / noise) ** 2, nan=large, posinf=large), 0.0).sum((1, 2))
+        for p in (predicted, base)
+    )
+    white = measured.sum()
+    return float(max(np.minimum(own, was).sum() - white, 0.0) / max(was.sum() - white, 1e-12))
 
 
 def are_kin(one: str, other: str) -> bool:
@@ -131,7 +153,9 @@ def decide(
 
 
 def _explains(entry: Entry, none: Entry, thresholds: Thresholds) -> bool:
-    return share_left(entry.misfit, none.misfit) <= thresholds.left or entry.misfit.p_value >= FALSE_ALARMS
+    """In the residuals of pieces of windows, or, where the sensors' own errors are what is left there, ahead."""
+    left = min(share_left(entry.misfit, none.misfit), entry.ahead)
+    return left <= thresholds.left or entry.misfit.p_value >= FALSE_ALARMS
 
 
 def _suffices(entry: Entry, tied: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:

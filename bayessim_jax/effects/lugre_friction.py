@@ -64,4 +64,4 @@ class LuGreFriction(ForceEffect):
 
 def _level(values: Values, velocity: Number) -> Number:
     ratio = velocity / values["velocity"]
-    return values["coulomb"] + (values["static"] - values["coulomb"]) * jnp.exp(-ratio * ratio)
+    return values["coulomb"] + jnp.maximum(values["static"] - values["coulomb"], 0.0) * jnp.exp(-ratio * ratio)

@@ -14,7 +14,7 @@ __all__ = ["StribeckFriction"]
 class StribeckFriction(ForceEffect):
     """τ = −F(v) sign(v) in motion, at rest whatever holds the joint up to F_s.
 
-        F(v) = F_c + (F_s − F_c) exp(−(v/v_s)²)
+        F(v) = F_c + max(F_s − F_c, 0) exp(−(v/v_s)²)
 
     τ = −clip(m (v/h + a), ±F(v)). F_c and F_s in N m or N, v_s in rad/s or m/s.
 
@@ -41,5 +41,5 @@ class StribeckFriction(ForceEffect):
         """Opposes motion, or holds."""
         ratio = moment.velocity / values["velocity"]
         coulomb = values["coulomb"]
-        level = coulomb + (values["static"] - coulomb) * jnp.exp(-ratio * ratio)
+        level = coulomb + jnp.maximum(values["static"] - coulomb, 0.0) * jnp.exp(-ratio * ratio)
         return -jnp.clip(moment.stop, -level, level), memory

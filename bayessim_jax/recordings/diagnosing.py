@@ -210,7 +210,9 @@ def _take_case(key: Array, model: CaseModel, effects: Sequence[Any], say: Callab
         motion=_motion(model, pieces, cut_windows(_thin(split_windows(smooth)[0], MOST_FITTED), rows)),
         step=model.step,
     )
-    problem = dataclasses.replace(whole, shots=model.shots(pieces), group=pieces.recording)
+    # as many windows as are predicted in the end, so that both are one program
+    ahead = model.shots(take(fitted, np.resize(np.arange(len(fitted)), len(windows))))
+    problem = dataclasses.replace(whole, shots=model.shots(pieces), group=pieces.recording, ahead=ahead)
     return _Taken(model, windows, np.arange(len(windows)) < len(fitted), pieces, whole, problem, settled)
 
 
