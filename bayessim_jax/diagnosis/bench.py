@@ -114,10 +114,6 @@ class Bench:
         """Numbers of a candidate's parameters among those of all effects."""
         return [i for k in candidate.effects for i in range(self.first[k], self.first[k + 1])]
 
-    def fits(self, candidate: Candidate) -> bool:
-        """Whether it has no more parameters than there are places for."""
-        return len(self.columns(candidate)) <= self.slots
-
     def setup(
         self,
         candidate: Candidate,
