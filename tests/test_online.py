@@ -252,6 +252,7 @@ def test_recordings_that_are_replayed_are_those_of_the_truth():
     assert not jnp.allclose(other.observations, seen.observations)
 
 
+@pytest.mark.slow
 def test_a_planner_in_the_loop_is_simulated_with_its_actions_and_forgets():
     system, task = Pendulum.create(), Upswing(steps=30)
     planner = default_planner("disco", "pendulum", system, task, horizon=5, samples=8, particles=2)

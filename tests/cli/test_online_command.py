@@ -302,7 +302,7 @@ def test_planners_take_their_settings_and_targets():
     assert make_plan(Settings("pendulum", controller="ppo")).settings.controller == "ppo"
 
 
-@pytest.mark.parametrize("system", ["skid_steer", "pendulum"])
+@pytest.mark.parametrize("system", ["skid_steer", pytest.param("pendulum", marks=pytest.mark.slow)])
 def test_a_planner_drives_through_the_command(tmp_path, system):
     out = tmp_path / "run"
     text = TINY[: TINY.index("[learner]")].replace('"cartpole"', f'"{system}"').replace("rounds = 3", "rounds = 2")
@@ -317,7 +317,10 @@ def test_a_planner_drives_through_the_command(tmp_path, system):
     assert ("Paths around the circle" in page) == ('class="wide animation"' in page) == (system == "skid_steer")
 
 
-@pytest.mark.parametrize(("scheme", "inferred"), [("offline", [False, True, False]), ("uniform", [False] * 3)])
+@pytest.mark.parametrize(
+    ("scheme", "inferred"),
+    [pytest.param("offline", [False, True, False], marks=pytest.mark.slow), ("uniform", [False] * 3)],
+)
 def test_other_schemes_infer_once_or_never(tmp_path, scheme, inferred):
     (tmp_path / "c.toml").write_text(TINY)
     words = ["cartpole", "--config", tmp_path / "c.toml", "--scheme", scheme, "--warmup", 1, "--out", tmp_path / "run"]
