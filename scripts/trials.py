@@ -88,18 +88,23 @@ def resume(
     for index in range(runs):
         if index not in known:
             start = time.monotonic()
-            known[index] = make(index) | {"run": index, "seconds": time.monotonic() - start}
+            known[index] = _rounded(make(index)) | {"run": index, "seconds": time.monotonic() - start}
             if out:
                 save(out, labels | known[index])
         yield known[index]
 
 
-def save(path: Path, result: dict[str, Any]) -> None:
-    """Append one run as a line of JSON, arrays to four decimals."""
-    plain = {
-        name: np.round(value.astype(float), 4).tolist() if isinstance(value, np.ndarray) else value
+def _rounded(result: dict[str, Any]) -> dict[str, Any]:
+    """Arrays to four decimals, so that a run that is read again is the run that was made."""
+    return {
+        name: np.round(value.astype(float), 4) if isinstance(value, np.ndarray) else value
         for name, value in result.items()
     }
+
+
+def save(path: Path, result: dict[str, Any]) -> None:
+    """Append one run as a line of JSON."""
+    plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in result.items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(plain) + "\n")
