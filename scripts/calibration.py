@@ -13,7 +13,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from trials import trials
+from trials import gather, trials
 
 from bayessim_jax import online
 from bayessim_jax.inference import PROPOSALS
@@ -45,11 +45,9 @@ def main() -> None:
         history=args.recordings * args.rounds,
         evaluations=0,
     )
-    results = []
     labels = {"system": args.system, "proposal": args.proposal, "recordings": args.recordings}
-    for result in trials(setup, args.runs, args.rounds, args.seed, out=args.out, labels=labels):
-        results.append(result)
-        print(f"run {len(results)}/{args.runs}: {result['seconds']:.1f} s", end="\r", flush=True)
+    made = trials(setup, args.runs, args.rounds, args.seed, out=args.out, labels=labels)
+    results = gather(made, args.runs, "run")
     print()
     log_q, level, rank = (np.stack([r[name] for r in results]) for name in ("log_q", "level", "rank"))
     for t in range(args.rounds):

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from trials import resume
+from trials import gather, resume
 
 from bayessim_jax import online
 from bayessim_jax.beliefs import GaussianMixture
@@ -42,10 +42,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="file of JSON lines to append runs to, and to resume from")
     args = parser.parse_args()
     labels = {name: value for name, value in vars(args).items() if name not in ("runs", "out")}
-    rows = []
-    for result in resume(make_trial(args), args.runs, args.out, labels):
-        rows.append(result)
-        print(f"{len(rows)}/{args.runs}: {result['seconds']:.0f} s", end="\r", flush=True)
+    rows = gather(resume(make_trial(args), args.runs, args.out, labels), args.runs)
     cost, informed = (np.stack([row[name] for row in rows]) for name in ("cost", "informed"))
     stale = np.array([row["stale"] for row in rows])
     print(

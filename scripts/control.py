@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from trials import resume
+from trials import gather, resume
 
 from bayessim_jax import online
 from bayessim_jax.beliefs import Uniform
@@ -41,12 +41,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="file of JSON lines to append runs to, and to resume from")
     args = parser.parse_args()
     for name in args.systems:
-        rows: list[dict[str, Any]] = []
         labels = {"system": name, "seed": args.seed, "rounds": args.rounds, "episodes": args.episodes}
         make = _trial(name, args.rounds, args.episodes, args.seed)
-        for result in resume(make, args.runs, args.out, labels):
-            rows.append(result)
-            print(f"{name} {len(rows)}/{args.runs}: {result['seconds']:.0f} s", end="\r", flush=True)
+        rows = gather(resume(make, args.runs, args.out, labels), args.runs, name)
         print(f"{name}: {args.runs} runs of {args.rounds} rounds, {args.episodes} episodes each" + 20 * " ")
         for way in ("online", "uniform", "truth"):
             means = np.array([r[way]["return"] for r in rows])

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
-from trials import resume
+from trials import gather, resume
 
 from bayessim_jax import online
 from bayessim_jax.cli.options import HABITS
@@ -60,10 +60,7 @@ def main() -> None:
                 "seed": args.seed,
                 "small": args.small,
             }
-            results = []
-            for result in resume(make, args.runs, args.out, labels):
-                results.append(result)
-                print(f"{name} {scheme} {len(results)}/{args.runs}: {result['seconds']:.0f} s", end="\r", flush=True)
+            results = gather(resume(make, args.runs, args.out, labels), args.runs, f"{name} {scheme}")
             success = np.stack([r["success"] for r in results])
             curves.setdefault(name, {})[scheme] = steps, success
             last = success[:, -1]

@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from trials import trials
+from trials import gather, trials
 
 from bayessim_jax import online
 from bayessim_jax.cli.options import HABITS
@@ -87,12 +87,9 @@ def main() -> None:
             sizes = habits | (TINY if args.small else {})
             setup = online.Setup.create(system, learner, task, estimator=estimator(**fit), proposal=proposal, **sizes)
             target = partial(gymnasium_target, row, noise=system.noise) if row == "hopper" else None
-            results = []
             labels = {"row": row, "column": column, "small": args.small}
             made = trials(setup, args.runs, rounds, args.seed, out=args.out, labels=labels, target=target)
-            for result in made:
-                results.append(result)
-                print(f"{row} {column} {len(results)}/{args.runs}: {result['seconds']:.0f} s", end="\r", flush=True)
+            results = gather(made, args.runs, f"{row} {column}")
             last = np.stack([r["log_q"][-1] for r in results])
             level = np.stack([r["level"][-1] for r in results])
             width = np.log(np.asarray(box.width)).sum()

@@ -15,7 +15,7 @@ from bayessim_jax.engines.simulated import SimulatedTarget
 from bayessim_jax.recordings.summaries import summarize
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
 
 
@@ -92,6 +92,15 @@ def resume(
             if out:
                 save(out, labels | known[index])
         yield known[index]
+
+
+def gather(results: Iterable[dict[str, Any]], runs: int, name: str = "") -> list[dict[str, Any]]:
+    """All results, told one after the other in a line that is written over."""
+    done = []
+    for result in results:
+        done.append(result)
+        print(f"{name} {len(done)}/{runs}: {result['seconds']:.0f} s".lstrip(), end="\r", flush=True)
+    return done
 
 
 def _rounded(result: dict[str, Any]) -> dict[str, Any]:

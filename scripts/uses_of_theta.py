@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from trials import resume
+from trials import gather, resume
 
 from bayessim_jax.beliefs import GaussianMixture, Truncated
 from bayessim_jax.control import default_planner
@@ -59,11 +59,7 @@ def main() -> None:
 
 def _runs(name: str, belief: str, args: argparse.Namespace) -> list[dict[str, Any]]:
     labels = {"system": name, "belief": belief, "seed": args.seed, "budget": args.budget, "steps": args.steps}
-    rows = []
-    for result in resume(_trial(name, belief, args), args.runs, args.out, labels):
-        rows.append(result)
-        print(f"{name} {belief} {len(rows)}/{args.runs}: {result['seconds']:.0f} s", end="\r", flush=True)
-    return rows
+    return gather(resume(_trial(name, belief, args), args.runs, args.out, labels), args.runs, f"{name} {belief}")
 
 
 def _cell(way: str, rows: list[dict[str, Any]]) -> str:
