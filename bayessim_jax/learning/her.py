@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import flax.linen as nn
@@ -16,7 +17,7 @@ from jaxtyping import Array, Int, PRNGKeyArray
 from bayessim_jax.contracts import Belief, Box, GoalTask, Scalar, System, Task
 from bayessim_jax.learning.collect import Transitions, blank, collect
 from bayessim_jax.learning.heads import Explorer, draw, normal
-from bayessim_jax.learning.networks import Mlp
+from bayessim_jax.learning.networks import Mlp, evaluate_critics
 from bayessim_jax.learning.normalisation import Moments
 from bayessim_jax.learning.policies import NetworkPolicy
 from bayessim_jax.learning.replay import Replay
@@ -236,11 +237,6 @@ class Her:
         mean = jnp.sum(moved) * self.horizon / jnp.maximum(replay.filled, 1)
         return self.idle + (1.0 - self.idle) * jnp.minimum(moved / jnp.maximum(mean, 1e-9), 1.0)
 
-    def _values(self, critics: Any, seen: Any, action: Any) -> Any:
-        both = jnp.concatenate([seen, action], -1)
-        values: Any = [self.critic.apply(weights, both) for weights in critics]
-        return jnp.concatenate(values, -1)
-
     def _act(self, weights: Any, seen: Any) -> Any:
         outputs: Any = self.network.apply(weights, seen)
         return self.head.mode(outputs)
@@ -252,18 +248,20 @@ class Her:
         batches = self._replay(replay_key, state)
         noises = normal(draw(noise_key, (self.updates, self.batch, self.head.box.size)))
 
+        values = partial(evaluate_critics, self.critic)
+
         def loss(flat: Any, slow: Any, noise: Any, seen: Any, action: Any, after: Any, reward: Any, sound: Any) -> Any:
             weights, frozen, slow = unravel(flat), unravel(jax.lax.stop_gradient(flat)), unravel(slow)
             mean = lambda x: jnp.sum(sound * x) / jnp.maximum(jnp.sum(sound), 1.0)  # noqa: E731
             shake = jnp.clip(self.smoothing * noise, -2.5 * self.smoothing, 2.5 * self.smoothing)
             next_action = jnp.clip(self._act(slow["policy"], after) + shake, -1.0, 1.0)
-            ahead = jnp.min(self._values(slow["critics"], after, next_action), -1)
+            ahead = jnp.min(values(slow["critics"], after, next_action), -1)
             low, high = jnp.minimum(reward.min(), 0.0), jnp.maximum(reward.max(), 0.0)
             target = jnp.clip(reward + self.gamma * ahead, low / (1.0 - self.gamma), high / (1.0 - self.gamma))
-            error = self._values(weights["critics"], seen, action) - target[:, None]
+            error = values(weights["critics"], seen, action) - target[:, None]
             value_loss = mean(jnp.sum(error**2, -1))
             chosen = self._act(weights["policy"], seen)
-            climbed = self._values(frozen["critics"], seen, chosen)[..., 0]
+            climbed = values(frozen["critics"], seen, chosen)[..., 0]
             policy_loss = mean(self.penalty * jnp.mean(chosen**2, -1) - climbed)
             return value_loss + policy_loss, value_loss
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import flax.linen as nn
@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-__all__ = ["Mlp"]
+__all__ = ["Mlp", "evaluate_critics"]
 
 
 class Mlp(nn.Module):
@@ -31,6 +31,15 @@ class Mlp(nn.Module):
         for width in self.widths:
             x = self.activation(nn.Dense(width, kernel_init=_normal(2**0.5))(x))
         return nn.Dense(self.outputs, kernel_init=_normal(self.output_gain))(x)
+
+
+def evaluate_critics(
+    critic: Mlp, critics: Sequence[Any], seen: Float[Array, "batch obs"], action: Float[Array, "batch act"]
+) -> Float[Array, "batch critics"]:
+    """Q(y, u) of every critic, one network with several weights."""
+    both = jnp.concatenate([seen, action], -1)
+    values: Any = [critic.apply(weights, both) for weights in critics]
+    return jnp.concatenate(values, -1)
 
 
 def _normal(gain: float) -> Callable[..., Any]:

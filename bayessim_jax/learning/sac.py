@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import flax.linen as nn
@@ -15,7 +16,7 @@ from jaxtyping import Array, Int, PRNGKeyArray
 from bayessim_jax.contracts import Belief, Box, Scalar, System, Task
 from bayessim_jax.learning.collect import Episodes, blank, collect
 from bayessim_jax.learning.heads import SquashedGaussian, draw
-from bayessim_jax.learning.networks import Mlp
+from bayessim_jax.learning.networks import Mlp, evaluate_critics
 from bayessim_jax.learning.normalisation import Scaling
 from bayessim_jax.learning.policies import NetworkPolicy
 from bayessim_jax.learning.replay import Replay
@@ -215,11 +216,6 @@ class Sac:
         raw = jax.vmap(self.head.sample)(outputs, noise)
         return jnp.tanh(raw), jax.vmap(self.head.log_prob)(outputs, raw)
 
-    def _values(self, critics: Any, seen: Any, action: Any) -> Any:
-        both = jnp.concatenate([seen, action], -1)
-        values: Any = [self.critic.apply(weights, both) for weights in critics]
-        return jnp.concatenate(values, -1)
-
     def _improve(self, key: PRNGKeyArray, state: SacState) -> tuple[SacState, Any]:
         """`updates` gradient steps of all three losses at once; each loss moves its own weights only."""
         obs, act = self.system.observations.size, self.head.box.size
@@ -228,6 +224,8 @@ class Sac:
         sample_key, noise_key = jax.random.split(key)
         batches = state.replay.sample(sample_key, (self.updates, self.batch))
         noises = self.head.noise(draw(noise_key, (self.updates, 2, self.batch, self.head.chances)))
+
+        values = partial(evaluate_critics, self.critic)
 
         def loss(flat: Any, slow: Any, batch: Any, noise: Any) -> Any:
             weights, frozen = unravel(flat), unravel(jax.lax.stop_gradient(flat))
@@ -238,13 +236,13 @@ class Sac:
             temperature = jnp.exp(frozen["log_temperature"])
 
             next_action, next_log_prob = self._act(frozen["policy"], after, noise[0])
-            ahead = jnp.min(self._values(unravel_slow(slow), after, next_action), -1) - temperature * next_log_prob
+            ahead = jnp.min(values(unravel_slow(slow), after, next_action), -1) - temperature * next_log_prob
             target = reward + self.gamma * (1.0 - terminated) * ahead
-            error = self._values(weights["critics"], seen, action) - target[:, None]
+            error = values(weights["critics"], seen, action) - target[:, None]
             value_loss = mean(jnp.sum(error**2, -1)) / 2
 
             chosen, log_prob = self._act(weights["policy"], seen, noise[1])
-            policy_loss = mean(temperature * log_prob - jnp.min(self._values(frozen["critics"], seen, chosen), -1))
+            policy_loss = mean(temperature * log_prob - jnp.min(values(frozen["critics"], seen, chosen), -1))
             surplus = jax.lax.stop_gradient(mean(log_prob)) + self.entropy_target
             total = value_loss + policy_loss - weights["log_temperature"] * surplus
             return total, (value_loss, -mean(log_prob))
