@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +32,10 @@ class Margin:
     b: float = struct.field(pytree_node=False)
     low: float = struct.field(pytree_node=False, default=-float("inf"))
     high: float = struct.field(pytree_node=False, default=float("inf"))
+
+    def between(self, a: Any, b: Any) -> Margin:
+        """The same kind with other numbers, which may be traced."""
+        return replace(self, a=a, b=b)
 
     def value(self, z: Scalar) -> Scalar:
         """θ at a standard normal z."""

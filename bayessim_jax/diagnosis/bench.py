@@ -25,7 +25,7 @@ from bayessim_jax.inference.replay import Inputs, replay_window
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Fit, Shots, expand, solve
 from bayessim_jax.systems.mjcf import MjcfSystem
 
-__all__ = ["NEAR", "SLOTS", "Bench", "Candidate", "moves"]
+__all__ = ["NEAR", "SLOTS", "Bench", "Candidate", "begin_value", "margin_of_effect"]
 
 NEAR = 0.1
 """Of the way from an effect's neutral value to where a fit usually begins: weak effects are found from there."""
@@ -81,9 +81,7 @@ class Bench:
         wired = self.union.effects if self.pairs else ()
         self.parameters = [p for w in wired for p in w.parameters]
         self.first = np.cumsum([0, *(len(w.parameters) for w in wired)])
-        self.each: list[Margin] = [
-            log_uniform(p.low, p.high) if p.log else uniform(p.low, p.high) for p in self.parameters
-        ]
+        self.each: list[Margin] = [margin_of_effect(p) for p in self.parameters]
         self.neutral = np.array([p.neutral for p in self.parameters])
 
     @property
@@ -143,8 +141,7 @@ class Bench:
             pairs = zip(columns, values, strict=True)
             return np.array([float(self.each[i].standard(jnp.asarray(v, float))) for i, v in pairs])
 
-        begin = standard([p.start for p in own])
-        near = standard([p.neutral + NEAR * (p.start - p.neutral) if moves(p) else p.start for p in own])
+        begin, near = (standard([begin_value(p, share) for p in own]) for share in (1.0, NEAR))
         points = [near, begin] if len(own) and np.abs(near - begin).max() > 1e-9 else [begin]
         points += [-begin] if any(p.low < 0.0 for p in own) else []
         rest = np.zeros(self.slots - len(columns))
@@ -163,9 +160,7 @@ class Bench:
             z = jnp.zeros(d + len(each) + 1, x.dtype).at[tried.index].set(x)
             theta = margins.theta(z[:d])
             if each:
-                own = [
-                    dataclasses.replace(m, a=tried.low[k], b=tried.high[k]).value(z[d + k]) for k, m in enumerate(each)
-                ]
+                own = [m.between(tried.low[k], tried.high[k]).value(z[d + k]) for k, m in enumerate(each)]
                 theta = jnp.concatenate([theta, jnp.where(tried.on, jnp.stack(own), tried.neutral)])
             return replay_window(union, theta, delta, tried.window)
 
@@ -210,9 +205,15 @@ class Bench:
         return _look(self.predict, shots, fit.z, fit.delta, self.step)
 
 
-def moves(p: EffectParameter) -> bool:
-    """Whether an effect grows from its neutral value along a parameter."""
-    return np.isfinite(p.neutral) and p.low <= p.neutral <= p.high and not p.log
+def margin_of_effect(p: EffectParameter) -> Margin:
+    """The prior of an effect's parameter."""
+    return log_uniform(p.low, p.high) if p.log else uniform(p.low, p.high)
+
+
+def begin_value(p: EffectParameter, share: float = 1.0) -> float:
+    """Where a fit begins: so much of the way from neutral to the usual value, if the effect grows along it."""
+    grows = np.isfinite(p.neutral) and p.low <= p.neutral <= p.high and not p.log
+    return p.neutral + share * (p.start - p.neutral) if grows and share < 1.0 else p.start
 
 
 @partial(jax.jit, static_argnames=("predict", "step"), compiler_options=COMPILER_OPTIONS)

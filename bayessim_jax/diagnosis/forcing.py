@@ -6,7 +6,6 @@ and the programs know no model: another machine finds them in the compilation ca
 
 from __future__ import annotations
 
-import dataclasses
 from functools import partial
 from typing import Any
 
@@ -42,11 +41,7 @@ class Joint:
 
 
 def _values(kinds: Kinds, x: Array, low: Array, high: Array) -> dict[str, Array]:
-    margins = [Margin(kind, 0.0, 1.0) for _, kind in kinds]
-    return {
-        name: dataclasses.replace(m, a=low[k], b=high[k]).value(x[k])
-        for k, (m, (name, _)) in enumerate(zip(margins, kinds, strict=True))
-    }
+    return {name: Margin(kind, 0.0, 1.0).between(low[k], high[k]).value(x[k]) for k, (name, kind) in enumerate(kinds)}
 
 
 @partial(jax.jit, static_argnames=("effect", "kinds", "detail", "h", "steps"), compiler_options=COMPILER_OPTIONS)

@@ -16,11 +16,11 @@ from bayessim_jax.beliefs.margins import Margins
 from bayessim_jax.diagnosis.bench import SLOTS, Bench, Candidate
 from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.diagnosis.scene import Scene
-from bayessim_jax.diagnosis.screen import Screen, Screened
+from bayessim_jax.diagnosis.screen import LEAST_SHARE, Screen, Screened
 from bayessim_jax.diagnosis.verdict import Diagnosis, Entry, Thresholds, are_kin, decide, error_left, share_left
 from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, judge_misfit
 from bayessim_jax.effects import Scales
-from bayessim_jax.inference.direct import noise_floor
+from bayessim_jax.inference.direct import noise_floor, noise_level
 from bayessim_jax.inference.shooting import Fit, Shots
 from bayessim_jax.systems.mjcf import MjcfSystem
 
@@ -64,9 +64,7 @@ class _Work:
         """Noise from the residuals of some windows."""
         counts = np.asarray(self.bench.shots.measured)[kept].sum((0, 1))
         states = self.bench.shots.spread.size * kept.sum()
-        share = max(1.0 - (fitted + states) / max(counts.sum(), 1), 0.2)
-        sigma = np.sqrt((r[kept] ** 2).sum((0, 1)) / np.maximum(counts * share, 1))
-        return jnp.maximum(jnp.asarray(sigma), self.floor)
+        return noise_level((r[kept] ** 2).sum((0, 1)), counts, int(fitted + states), self.floor, LEAST_SHARE)
 
     def settle(
         self, candidate: Candidate, fit: Fit, which: Bool[np.ndarray, " windows"], rounds: int = 4, steps: int = 12
@@ -107,11 +105,8 @@ class Problem:
         rows = np.unique(np.linspace(0, count - 1, min(SCREENED, count)).astype(int))
         motion = jax.tree.map(lambda x: x[rows], self.motion)
         shots = dataclasses.replace(self.shots, inputs=None, y=self.shots.y[rows], measured=self.shots.measured[rows])
-        group = self.group[rows]
-        labels = sorted(set(group.tolist()))
-        folds = np.array([np.isin(group, labels[i::FOLDS]) for i in range(min(FOLDS, len(labels)))])
         scene = Scene(self.system, self.margins, pairs, self.scales, shots, motion, self.step, slots)
-        return Screen(scene, folds)
+        return Screen(scene, np.array(_folds(self.group[rows])))
 
     def bench(self, pairs: Sequence[tuple[Any, str]], slots: int = SLOTS) -> Bench:
         """A bench for some of the pairs."""
@@ -176,7 +171,6 @@ def name_effects(
             best = {work.numbers[k] for entry in entries[:2] for k in entry.candidate.effects}
             kept = [*pairs, *(found for found in ranked if found.candidate.effects[0] in alone | best)]
             work = _bench_of(key, problem, kept, say)
-            none = _without(work, problem, detected)
             entries = _finish(work, none, kept, problem.ahead)
     return decide(work.bench, none, entries, work.group, thresholds, listed)
 
@@ -277,24 +271,26 @@ def _finish(work: _Work, none: Entry, candidates: Sequence[Screened], ahead: Sho
         if np.isfinite(float(fit.cost)):
             entry = _enter(work, own, work.settle(own, fit, every))
             if ahead is not None and base is not None:
-                entry.ahead = error_left(ahead, bench.replay(own, fit.z, ahead), base, entry.misfit.noise)
+                entry.ahead = error_left(ahead, bench.replay(own, entry.fit.z, ahead), base, entry.misfit.noise)
             entry.scores = np.logaddexp(np.log1p(-DOUBT) + entry.scores, np.log(DOUBT) + none.scores)
             entries.append(entry)
             work.say(f"{' + '.join(entry.names)}: score {entry.score:.1f}")
     return sorted(entries, key=lambda entry: -entry.score)
 
 
-def _enter(
-    work: _Work, candidate: Candidate, fit: Fit, folds: int = FOLDS, known: Float[np.ndarray, "..."] | float = 0.0
-) -> Entry:
-    """Score a candidate on windows that its fit has not seen, recording by recording or in as many folds."""
-    bench, group = work.bench, work.group
+def _folds(group: Int[np.ndarray, " windows"]) -> list[Bool[np.ndarray, " windows"]]:
+    """The windows of every group of recordings; of one recording alone, groups of its windows."""
     units = group if len(set(group.tolist())) > 1 else np.arange(len(group))
     labels = sorted(set(units.tolist()))
+    return [np.isin(units, labels[i::FOLDS]) for i in range(min(FOLDS, len(labels)))]
+
+
+def _enter(work: _Work, candidate: Candidate, fit: Fit, known: Float[np.ndarray, "..."] | float = 0.0) -> Entry:
+    """Score a candidate on windows that its fit has not seen, recording by recording or in as many folds."""
+    bench, group = work.bench, work.group
     measured = np.asarray(bench.shots.measured)
     scores = np.zeros(len(group))
-    for part in [labels[i::folds] for i in range(min(folds, len(labels)))]:
-        out = np.isin(units, part)
+    for out in _folds(group):
         kept = ~out if not out.all() else out
         trained = work.settle(candidate, fit, kept, rounds=1, steps=6)
         judged = bench.fit(candidate, trained.z, fit.delta, trained.sigma, work.mask(out), steps=6, only_states=True)

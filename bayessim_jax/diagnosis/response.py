@@ -23,7 +23,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from bayessim_jax.contracts import Scalar
-from bayessim_jax.inference.shooting import Curvature, eliminate
+from bayessim_jax.inference.shooting import Curvature, eliminate, normal_equations
 from bayessim_jax.systems.mjcf import displace
 
 __all__ = [
@@ -198,22 +198,7 @@ def assess(
     each = replace(windowed, spread=spread)
     r, slopes = jax.vmap(one)(lin.a, lin.b, lin.along, lin.gap, each, forcing, delta)
     slopes = slopes.at[:, k:].multiply(windowed.spread[:, None])
-    return _normal(r.reshape(len(delta), -1), slopes, p, delta / windowed.spread), r, slopes
-
-
-def _normal(r: Array, slopes: Array, p: Array, scaled: Array) -> Curvature:
-    k, n = p.size, scaled.shape[-1]
-    products = jnp.einsum("wik,wjk->wij", slopes, slopes)
-    pulls = jnp.einsum("wik,wk->wi", slopes, r)
-    return Curvature(
-        cost=0.5 * ((r**2).sum() + p @ p + (scaled**2).sum()),
-        hessian=products[:, :k, :k].sum(0) + jnp.eye(k),
-        gradient=pulls[:, :k].sum(0) - p,
-        own=products[:, k:, k:] + jnp.eye(n),
-        cross=products[:, k:, :k],
-        own_gradient=pulls[:, k:] - scaled,
-        pulls=pulls[:, :k],
-    )
+    return normal_equations(r.reshape(len(delta), -1), slopes, p, delta / windowed.spread), r, slopes
 
 
 @jax.jit

@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from bayessim_jax.beliefs.margins import Margin, Margins, log_uniform, uniform
-from bayessim_jax.diagnosis.bench import SLOTS, Candidate
+from bayessim_jax.beliefs.margins import Margin, Margins
+from bayessim_jax.diagnosis.bench import SLOTS, Candidate, margin_of_effect
 from bayessim_jax.diagnosis.forcing import Joint, commands_of, force_of, restore_readings
 from bayessim_jax.diagnosis.response import Forcing, Linearized, Motion, Windowed, assess, linearize_steps
 from bayessim_jax.effects import Scales, at, with_effects
@@ -65,9 +65,7 @@ class Scene:
         self.system, self.margins, self.pairs, self.step, self.slots = system, margins, tuple(pairs), step, slots
         self.motion, self.shots = motion, shots
         self.parameters = [effect.parameters(place, scales[place]) for effect, place in self.pairs]
-        self.margin: list[list[Margin]] = [
-            [log_uniform(p.low, p.high) if p.log else uniform(p.low, p.high) for p in each] for each in self.parameters
-        ]
+        self.margin: list[list[Margin]] = [[margin_of_effect(p) for p in each] for each in self.parameters]
         self.kinds = [
             tuple((p.name, m.kind) for p, m in zip(*each, strict=True))
             for each in zip(self.parameters, self.margin, strict=True)
@@ -148,11 +146,7 @@ class Scene:
         def numbers(full: Array) -> Array:
             x, on, low, high, neutral = (full[d + i * m : d + (i + 1) * m] for i in range(5))
             values = [
-                jnp.where(
-                    on[i] > 0.5,
-                    dataclasses.replace(Margin(kind, 0.0, 1.0), a=low[i], b=high[i]).value(x[i]),
-                    neutral[i],
-                )
+                jnp.where(on[i] > 0.5, Margin(kind, 0.0, 1.0).between(low[i], high[i]).value(x[i]), neutral[i])
                 for i, kind in enumerate(kinds)
             ]
             theta = jnp.concatenate([margins.theta(full[:d]), jnp.stack(values)])

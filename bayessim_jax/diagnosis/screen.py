@@ -15,17 +15,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from bayessim_jax.diagnosis.bench import NEAR, Candidate, moves
+from bayessim_jax.diagnosis.bench import NEAR, Candidate, begin_value
 from bayessim_jax.diagnosis.response import cross_validate, propose
 from bayessim_jax.diagnosis.scene import Scene
 from bayessim_jax.diagnosis.whiteness import Misfit, judge_misfit
-from bayessim_jax.inference.direct import noise_floor
+from bayessim_jax.inference.direct import noise_floor, noise_level
 
 __all__ = ["Begun", "Screen", "Screened"]
 
 ITERATIONS = 6
 BEGINNING, KEPT, LASTING = 8, 2, 8
 """Steps of the solver from every point that a candidate is begun from, how many go on, and their further steps."""
+LEAST_SHARE = 0.2
+"""Of the numbers measured, that noise is taken to have in the residuals however many are fitted."""
 GLANCING = 6
 """Steps of the solver from each of two points, by which partners of a known effect are ranked."""
 MOMENTS, CLOCK = 8, 2.0
@@ -123,14 +125,13 @@ class Screen:
         measured = np.asarray(self.shots.measured)
         counts = np.maximum(measured.sum((0, 1)), 1)
         fitted = self.d + self.scene.count(candidate) + delta.size
-        share = max(1.0 - fitted / counts.sum(), 0.2)
         r = slopes = None
         for k in range(rounds):
             p, delta, curvature, r, slopes = self.fit(candidate, p, delta, sigma, iterations if k == 0 else 3)
             if curvature is None:
                 return None
             squares = (np.asarray(r) ** 2).sum((0, 1)) * np.asarray(sigma) ** 2
-            new = jnp.maximum(jnp.asarray(np.sqrt(squares / (counts * share))), self.floor)
+            new = noise_level(squares, counts, fitted, self.floor, LEAST_SHARE)
             r, slopes = r * (sigma / new), slopes * jnp.broadcast_to(sigma / new, self.shots.y.shape[1:]).reshape(-1)
             sigma = new
         free = jnp.arange(self.d + self.slots) < self.d + self.scene.count(candidate)
@@ -193,8 +194,7 @@ class Screen:
         each = [q for k in added.effects for q in zip(self.scene.parameters[k], self.scene.margin[k], strict=True)]
         costs = []
         for share in (NEAR, 1.0):
-            values = [p.neutral + share * (p.start - p.neutral) if moves(p) else p.start for p, _ in each]
-            start = [float(m.standard(jnp.asarray(v, float))) for v, (_, m) in zip(values, each, strict=True)]
+            start = [float(m.standard(jnp.asarray(begin_value(p, share), float))) for p, m in each]
             p = self._put(candidate, known, held, own, np.array(start))
             found = self.fit(candidate, p, known.delta, known.sigma, GLANCING)
             costs.append(np.inf if found[2] is None else float(found[2].cost))

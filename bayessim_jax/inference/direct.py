@@ -60,11 +60,20 @@ def estimate_noise(predict: Predict, shots: Shots, fit: Fit, floor: Float[Array,
     """Noise of every channel from what a fit leaves, √(Σ r² / (n (1 − k/N))) for k numbers fitted to N, or `floor`."""
     r = np.asarray(_residuals(predict, shots, fit.z, fit.delta, fit.sigma))
     counts = np.asarray(shots.measured).sum((0, 1))
-    fitted = fit.z.size + fit.delta.size
-    share = max(1.0 - fitted / max(counts.sum(), 1), 0.1)
     squares = (r**2).sum((0, 1)) * np.asarray(fit.sigma) ** 2
-    sigma = np.sqrt(squares / np.maximum(counts * share, 1))
-    return jnp.maximum(jnp.asarray(sigma), floor)
+    return noise_level(squares, counts, fit.z.size + fit.delta.size, floor)
+
+
+def noise_level(
+    squares: Float[np.ndarray, " obs"],
+    counts: Float[np.ndarray, " obs"],
+    fitted: int,
+    floor: Float[Array, " obs"],
+    least: float = 0.1,
+) -> Float[Array, " obs"]:
+    """√(Σ r² / (n (1 − k/N))) of every channel for k numbers fitted to N, or `floor`; 1 − k/N is at least `least`."""
+    share = max(1.0 - fitted / max(counts.sum(), 1), least)
+    return jnp.maximum(jnp.asarray(np.sqrt(squares / np.maximum(counts * share, 1))), floor)
 
 
 def noise_floor(shots: Shots) -> Float[Array, " obs"]:

@@ -32,6 +32,7 @@ __all__ = [
     "Predict",
     "Shots",
     "linearize",
+    "normal_equations",
     "Ridge",
     "profile",
     "residuals",
@@ -132,11 +133,17 @@ def expand(
 
 def linearize(predict: Predict, shots: Shots, z: Array, delta: Array, sigma: Array, *, step: float = 0.0) -> Curvature:
     """The normal equations at a point."""
-    d, n = z.size, delta.shape[-1]
     r, slopes = expand(predict, shots, z, delta, sigma, step)
+    return normal_equations(r, slopes, z - shots.center, (delta - shots.shift) / shots.spread)
+
+
+def normal_equations(
+    r: Float[Array, "windows k"], slopes: Float[Array, "windows dn k"], own: Float[Array, " d"], scaled: Array
+) -> Curvature:
+    """Of residuals and slopes as `expand` gives them; `own` and `scaled` are z and δ/S less their priors' means."""
+    d, n = own.size, scaled.shape[-1]
     products = jnp.einsum("wik,wjk->wij", slopes, slopes)
     pulls = jnp.einsum("wik,wk->wi", slopes, r)
-    own, scaled = z - shots.center, (delta - shots.shift) / shots.spread
     return Curvature(
         cost=0.5 * ((r**2).sum() + own @ own + (scaled**2).sum()),
         hessian=products[:, :d, :d].sum(0) + jnp.eye(d),

@@ -161,8 +161,9 @@ def _entries(diagnosis: CaseDiagnosis) -> str:
     for entry in diagnosis.result.entries:
         named = "yes" if entry in diagnosis.result.confusion else ""
         left = share_left(entry.misfit, base.misfit)
-        rows.append([" + ".join(entry.names), number(entry.score - base.score, 4), f"{100 * left:.2g} %", named])
-    return html.table(["finalist", "gain on recordings left out", "misfit left", "named"], rows)
+        shares = (f"{100 * share:.2g} %" for share in (left, entry.ahead))
+        rows.append([" + ".join(entry.names), number(entry.score - base.score, 4), *shares, named])
+    return html.table(["finalist", "gain on recordings left out", "misfit left", "error ahead left", "named"], rows)
 
 
 def _residuals(diagnosis: CaseDiagnosis) -> tuple[str, str, str]:

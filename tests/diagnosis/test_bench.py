@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayessim_jax.diagnosis.bench import Candidate
-from bayessim_jax.diagnosis.procedure import Problem
+from bayessim_jax.diagnosis.procedure import Problem, _folds
 from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.effects import EFFECTS, Scales
 from bayessim_jax.inference.replay import replay_window
@@ -114,3 +114,13 @@ def test_the_concealed_effect_comes_out_first_along_the_motion(problem):
     )
     simulated = bench.values(Candidate((0,)), fit.z)["coulomb_friction@joint/hinge/coulomb"]
     assert float(level) == pytest.approx(simulated, rel=0.05)
+
+
+@pytest.mark.parametrize("group", [[0] * 9, [0, 0, 0, 1, 1, 2, 2, 3, 4]])
+def test_every_window_is_scored_by_a_fit_to_others(group):
+    group = np.array(group)
+    folds = np.array(_folds(group))
+    assert (folds.sum(0) == 1).all()
+    assert (folds.sum(1) < len(group)).all()
+    if len(set(group)) > 1:
+        assert all((fold[group == label] == fold[group == label][0]).all() for fold in folds for label in set(group))
