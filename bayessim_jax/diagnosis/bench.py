@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from bayessim_jax.beliefs.margins import Margin, Margins, log_uniform, uniform
 from bayessim_jax.effects import EffectParameter, Scales, at, with_effects
 from bayessim_jax.inference.replay import Inputs, replay_window
-from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Fit, Shots, expand, solve
+from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Fit, Shots, solve
 from bayessim_jax.systems.mjcf import MjcfSystem
 
 __all__ = ["NEAR", "SLOTS", "Bench", "Candidate", "begin_value", "margin_of_effect"]
@@ -112,13 +112,8 @@ class Bench:
         """Numbers of a candidate's parameters among those of all effects."""
         return [i for k in candidate.effects for i in range(self.first[k], self.first[k + 1])]
 
-    def setup(
-        self,
-        candidate: Candidate,
-        measured: Bool[Array, "windows rows obs"] | None = None,
-        shots: Shots | None = None,
-    ) -> Shots:
-        """The windows (or others) with a candidate's parameters free; only what is `measured` counts."""
+    def setup(self, candidate: Candidate, shots: Shots | None = None) -> Shots:
+        """The windows (or others) with a candidate's parameters free."""
         every = self.shots if shots is None else shots
         columns = self.columns(candidate)
         unused = self.d + len(self.parameters)
@@ -129,8 +124,7 @@ class Bench:
         shared = (index, on, [m.a for m in self.each], [m.b for m in self.each], self.neutral)
         arrays = (jnp.asarray(x) for x in (*shared[:2], *(np.asarray(x, float) for x in shared[2:])))
         inputs = Tried(every.inputs, *(jnp.broadcast_to(x, (windows, x.size)) for x in arrays))
-        mask = every.measured if measured is None else measured
-        return dataclasses.replace(every, inputs=inputs, measured=mask)
+        return dataclasses.replace(every, inputs=inputs)
 
     def starts(self, candidate: Candidate, z: Float[Array, " d"]) -> list[Float[Array, " k"]]:
         """Points to begin from: θ as given, the effects a little off neutral, at their start values, and mirrored."""
@@ -182,14 +176,11 @@ class Bench:
         x: Float[Array, " k"],
         delta: Float[Array, "windows n"],
         sigma: Float[Array, " obs"],
-        measured: Bool[Array, "windows rows obs"],
         *,
         steps: int = 12,
-        only_states: bool = False,
     ) -> Fit:
-        """Fit a candidate from a point; with `only_states` x stays and the initial states alone are fitted."""
-        free = self.free(candidate) & (not only_states)
-        shots = self.setup(candidate, measured)
+        """Fit a candidate from a point."""
+        free, shots = self.free(candidate), self.setup(candidate)
         return solve(self.predict, shots, x, delta, sigma, free, steps=jnp.asarray(steps), step=self.step)
 
     def replay(
@@ -197,12 +188,7 @@ class Bench:
     ) -> Float[np.ndarray, "windows rows obs"]:
         """Predictions of windows from their recorded initial states, or from beside them."""
         still = jnp.broadcast_to(delta, (shots.y.shape[0], shots.spread.size))
-        return np.asarray(_replay(self.predict, x, still, self.setup(candidate, shots=shots).inputs))
-
-    def look(self, candidate: Candidate, fit: Fit, measured: Bool[Array, "windows rows obs"]) -> tuple[Array, Array]:
-        """Residuals in the channels' units, and the derivatives of predictions along the initial states over S."""
-        shots = self.setup(candidate, measured)
-        return _look(self.predict, shots, fit.z, fit.delta, self.step)
+        return np.asarray(_replay(self.predict, x, still, self.setup(candidate, shots).inputs))
 
 
 def margin_of_effect(p: EffectParameter) -> Margin:
@@ -214,16 +200,6 @@ def begin_value(p: EffectParameter, share: float = 1.0) -> float:
     """Where a fit begins: so much of the way from neutral to the usual value, if the effect grows along it."""
     grows = np.isfinite(p.neutral) and p.low <= p.neutral <= p.high and not p.log
     return p.neutral + share * (p.start - p.neutral) if grows and share < 1.0 else p.start
-
-
-@partial(jax.jit, static_argnames=("predict", "step"), compiler_options=COMPILER_OPTIONS)
-def _look(predict: Any, shots: Shots, x: Array, delta: Array, step: float) -> tuple[Array, Array]:
-    def states(_: Array, delta: Array, tried: Tried) -> Array:
-        return predict(x, delta, tried)
-
-    ones = jnp.ones(shots.y.shape[-1])
-    r, slopes = expand(states, shots, jnp.zeros(0), delta, ones, step)
-    return r.reshape(shots.y.shape), slopes
 
 
 @partial(jax.jit, static_argnames="predict", compiler_options=COMPILER_OPTIONS)

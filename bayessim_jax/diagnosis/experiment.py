@@ -123,7 +123,7 @@ def design(bench: Bench, members: Sequence[Entry], motions: Motions, shots: Shot
     for j, entry in enumerate(members):
         for i, y in enumerate(shown):
             if i != j:
-                own = bench.setup(entry.candidate, shots=dataclasses.replace(blank, y=jnp.asarray(y)))
+                own = bench.setup(entry.candidate, dataclasses.replace(blank, y=jnp.asarray(y)))
                 left = _separate(bench.predict, own, entry.fit.z, entry.fit.precision, members[i].fit.sigma, bench.step)
                 apart[i, j] = np.where(fine, np.nan_to_num(np.asarray(left)), 0.0)
     pairs = [(i, j) for i in range(len(members)) for j in range(i)]

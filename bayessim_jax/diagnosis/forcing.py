@@ -157,5 +157,5 @@ def restore_readings(
 
 
 def _with_slopes(f: Any, x: Array) -> tuple[Array, Array]:
-    along = jax.vmap(lambda d: jax.jvp(f, (x,), (d,))[1])(jnp.eye(x.size))
-    return f(x), jnp.moveaxis(along, 0, -1)
+    value, along = jax.vmap(lambda d: jax.jvp(f, (x,), (d,)), out_axes=(None, 0))(jnp.eye(x.size))
+    return value, jnp.moveaxis(along, 0, -1)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import chain
 from typing import Any
 
 import jax
@@ -14,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bayessim_jax.beliefs.margins import Margins
 from bayessim_jax.diagnosis.bench import SLOTS, Bench, Candidate
-from bayessim_jax.diagnosis.response import Motion
+from bayessim_jax.diagnosis.response import Motion, cross_validate
 from bayessim_jax.diagnosis.scene import Scene
 from bayessim_jax.diagnosis.screen import LEAST_SHARE, Screen, Screened
 from bayessim_jax.diagnosis.verdict import Diagnosis, Entry, Thresholds, are_kin, decide, error_left, share_left
@@ -38,6 +41,8 @@ WORTH = 0.5
 """Share of the best effect's gain from which another is simulated."""
 DOUBT = 0.05
 """Probability that a model fails in a window, where the simulator without effects then predicts."""
+WORKERS = 2
+"""Candidates that are simulated at the same time; what one finds does not depend on the others."""
 FOLDS = 4
 """Groups of recordings, each scored by fits to the others."""
 
@@ -54,28 +59,20 @@ class _Work:
     numbers: tuple[int, ...] = ()
     """Of the problem's pairs, those on the bench."""
 
-    def mask(self, which: Bool[np.ndarray, " windows"] | slice = slice(None)) -> Array:
-        """What was measured in some of the windows."""
-        chosen = np.zeros(len(self.group), bool)
-        chosen[which] = True
-        return self.bench.shots.measured & jnp.asarray(chosen)[:, None, None]
+    @cached_property
+    def folds(self) -> Bool[Array, "folds windows"]:
+        """Windows that are scored by fits to the others."""
+        return _folds(self.group)
 
-    def noise(self, r: np.ndarray, kept: np.ndarray, fitted: int) -> Array:
-        """Noise from the residuals of some windows."""
-        counts = np.asarray(self.bench.shots.measured)[kept].sum((0, 1))
-        states = self.bench.shots.spread.size * kept.sum()
-        return noise_level((r[kept] ** 2).sum((0, 1)), counts, int(fitted + states), self.floor, LEAST_SHARE)
-
-    def settle(
-        self, candidate: Candidate, fit: Fit, which: Bool[np.ndarray, " windows"], rounds: int = 4, steps: int = 12
-    ) -> Fit:
+    def settle(self, candidate: Candidate, fit: Fit, rounds: int = 4, steps: int = 12) -> Fit:
         """Fit a candidate and its noise in turn."""
-        free = self.bench.d + len(self.bench.columns(candidate))
+        counts = np.asarray(self.bench.shots.measured).sum((0, 1))
+        fitted = self.bench.d + len(self.bench.columns(candidate)) + fit.delta.size
         for _ in range(rounds):
-            r = np.asarray(self.bench.look(candidate, fit, self.mask())[0])
-            sigma = self.noise(r, which, free)
+            squares = (np.asarray(fit.misses) ** 2).sum((0, 1))
+            sigma = noise_level(squares, counts, fitted, self.floor, LEAST_SHARE)
             change = float(jnp.abs(jnp.log(sigma / fit.sigma)).max())
-            fit = self.bench.fit(candidate, fit.z, fit.delta, sigma, self.mask(which), steps=steps)
+            fit = self.bench.fit(candidate, fit.z, fit.delta, sigma, steps=steps)
             if change < 0.03:
                 break
         return fit
@@ -106,7 +103,7 @@ class Problem:
         motion = jax.tree.map(lambda x: x[rows], self.motion)
         shots = dataclasses.replace(self.shots, inputs=None, y=self.shots.y[rows], measured=self.shots.measured[rows])
         scene = Scene(self.system, self.margins, pairs, self.scales, shots, motion, self.step, slots)
-        return Screen(scene, np.array(_folds(self.group[rows])))
+        return Screen(scene, _folds(self.group[rows]))
 
     def bench(self, pairs: Sequence[tuple[Any, str]], slots: int = SLOTS) -> Bench:
         """A bench for some of the pairs."""
@@ -123,8 +120,8 @@ def detect(
     nothing, bench = Candidate(), problem.bench(())
     work = _Work(key, bench, problem.group, noise_floor(bench.shots), _quiet)
     x = bench.starts(nothing, baseline.z)[0]
-    fit = bench.fit(nothing, x, baseline.delta, baseline.sigma, work.mask(), steps=8)
-    return bench, _enter(work, nothing, work.settle(nothing, fit, np.ones(len(problem.group), bool)), known=known)
+    fit = bench.fit(nothing, x, baseline.delta, baseline.sigma, steps=8)
+    return bench, _enter(work, nothing, work.settle(nothing, fit), known=known)
 
 
 def is_mismatch(problem: Problem, detected: Entry, thresholds: Thresholds | None = None) -> bool:
@@ -252,8 +249,8 @@ def _without(work: _Work, problem: Problem, detected: Entry) -> Entry:
     """The simulator without effects on a bench that holds some; its fit and test are the ones of whole windows."""
     nothing, start = Candidate(), _still(problem, detected.fit)
     x = work.bench.starts(nothing, start.z[: work.bench.d])[0]
-    fit = work.bench.fit(nothing, x, start.delta, start.sigma, work.mask(), steps=12)
-    entry = _enter(work, nothing, work.settle(nothing, fit, np.ones(len(work.group), bool)))
+    fit = work.bench.fit(nothing, x, start.delta, start.sigma, steps=12)
+    entry = _enter(work, nothing, work.settle(nothing, fit))
     entry.misfit = dataclasses.replace(entry.misfit, p_value=detected.misfit.p_value)
     entry.fit = dataclasses.replace(fit, z=x.at[: work.bench.d].set(start.z[: work.bench.d]))
     return entry
@@ -261,45 +258,46 @@ def _without(work: _Work, problem: Problem, detected: Entry) -> Entry:
 
 def _finish(work: _Work, none: Entry, candidates: Sequence[Screened], ahead: Shots | None) -> list[Entry]:
     """Candidates simulated and fitted from where the screen found them, and scored across recordings, best first."""
-    entries, bench = [], work.bench
+    bench = work.bench
     base = None if ahead is None else bench.replay(Candidate(), none.fit.z, ahead)
-    every = np.ones(len(work.group), bool)
-    for found in candidates:
+
+    def finish(found: Screened) -> Entry | None:
         own = Candidate(tuple(work.numbers.index(k) for k in found.candidate.effects))
         delta, sigma = jnp.zeros_like(none.fit.delta), jnp.maximum(found.sigma, work.floor)
-        fit = bench.fit(own, found.p, delta, sigma, work.mask(), steps=12)
-        if np.isfinite(float(fit.cost)):
-            entry = _enter(work, own, work.settle(own, fit, every))
-            if ahead is not None and base is not None:
-                entry.ahead = error_left(ahead, bench.replay(own, entry.fit.z, ahead), base, entry.misfit.noise)
-            entry.scores = np.logaddexp(np.log1p(-DOUBT) + entry.scores, np.log(DOUBT) + none.scores)
-            entries.append(entry)
-            work.say(f"{' + '.join(entry.names)}: score {entry.score:.1f}")
+        fit = bench.fit(own, found.p, delta, sigma, steps=12)
+        if not np.isfinite(float(fit.cost)):
+            return None
+        entry = _enter(work, own, work.settle(own, fit))
+        if ahead is not None and base is not None:
+            entry.ahead = error_left(ahead, bench.replay(own, entry.fit.z, ahead), base, entry.misfit.noise)
+        entry.scores = np.logaddexp(np.log1p(-DOUBT) + entry.scores, np.log(DOUBT) + none.scores)
+        return entry
+
+    entries = []
+    with ThreadPoolExecutor(WORKERS) as pool:
+        # the first by itself: what it compiles is there for the others
+        for entry in chain(map(finish, candidates[:1]), pool.map(finish, candidates[1:])):
+            if entry is not None:
+                entries.append(entry)
+                work.say(f"{' + '.join(entry.names)}: score {entry.score:.1f}")
     return sorted(entries, key=lambda entry: -entry.score)
 
 
-def _folds(group: Int[np.ndarray, " windows"]) -> list[Bool[np.ndarray, " windows"]]:
+def _folds(group: Int[np.ndarray, " windows"]) -> Bool[Array, "folds windows"]:
     """The windows of every group of recordings; of one recording alone, groups of its windows."""
     units = group if len(set(group.tolist())) > 1 else np.arange(len(group))
     labels = sorted(set(units.tolist()))
-    return [np.isin(units, labels[i::FOLDS]) for i in range(min(FOLDS, len(labels)))]
+    return jnp.asarray(np.array([np.isin(units, labels[i::FOLDS]) for i in range(min(FOLDS, len(labels)))]))
 
 
 def _enter(work: _Work, candidate: Candidate, fit: Fit, known: Float[np.ndarray, "..."] | float = 0.0) -> Entry:
-    """Score a candidate on windows that its fit has not seen, recording by recording or in as many folds."""
-    bench, group = work.bench, work.group
-    measured = np.asarray(bench.shots.measured)
-    scores = np.zeros(len(group))
-    for out in _folds(group):
-        kept = ~out if not out.all() else out
-        trained = work.settle(candidate, fit, kept, rounds=1, steps=6)
-        judged = bench.fit(candidate, trained.z, fit.delta, trained.sigma, work.mask(out), steps=6, only_states=True)
-        r = np.asarray(bench.look(candidate, judged, work.mask(out))[0])
-        r = np.where(np.isfinite(r), r, 1e6)
-        sigma = np.asarray(trained.sigma)
-        logs = np.where(measured, -0.5 * (r / sigma) ** 2 - np.log(sigma), 0.0)
-        scores = np.where(out, logs.sum((1, 2)), scores)
+    """Score a candidate on windows that fits have not seen, recording by recording or in as many folds."""
+    bench, spread = work.bench, work.bench.shots.spread
+    measured = bench.shots.measured
+    scores = cross_validate(
+        fit.r, fit.slopes, measured, fit.z, bench.free(candidate), fit.sigma, work.floor, work.folds, fit.delta / spread
+    )
+    scores = np.nan_to_num(np.asarray(scores), nan=-1e12)
     misfit_key = jax.random.fold_in(work.key, sum(2**k for k in candidate.effects) % (2**31))
-    residual, slopes = bench.look(candidate, fit, work.mask())
-    misfit = judge_misfit(misfit_key, np.asarray(residual), slopes, measured, known)
+    misfit = judge_misfit(misfit_key, np.asarray(fit.misses), fit.along_states, np.asarray(measured), known)
     return Entry(candidate, bench.names(candidate), fit, scores, misfit)

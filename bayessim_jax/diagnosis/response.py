@@ -145,8 +145,7 @@ def linearize_steps(
             slopes = jax.vmap(lambda d: (moved(d, 1.0) - moved(d, -1.0)) / (2 * step))(directions)
             gap = advance(*point)
         else:
-            gap = advance(*point)
-            slopes = jax.vmap(lambda d: jax.jvp(advance, point, d)[1])(directions)
+            gap, slopes = jax.vmap(lambda d: jax.jvp(advance, point, d), out_axes=(None, 0))(directions)
         slopes = slopes.T
         return slopes[:, : 2 * nv], slopes[:, 2 * nv : 3 * nv], slopes[:, 3 * nv :], gap
 
@@ -224,13 +223,13 @@ def cross_validate(
     sigma: Float[Array, " obs"],
     floor: Float[Array, " obs"],
     folds: Bool[Array, "folds windows"],
+    scaled: Float[Array, "windows n"],
 ) -> Float[Array, " windows"]:
     """Log predictive density of every window by fits without the windows of its fold, linear around one fit to all.
 
-    Noise is that of the training windows; a window's own initial state is profiled out.
+    Noise is that of the training windows; a window's own initial state, δ/S = `scaled` in the fit, is profiled out.
     """
-    k = p.size
-    n = slopes.shape[1] - k
+    k, n = p.size, scaled.shape[-1]
     flat = r.reshape(len(r), -1)
     free_all = jnp.concatenate([free, jnp.ones(n, bool)])
     slopes = jnp.where(free_all[:, None], slopes, 0.0)
@@ -239,7 +238,7 @@ def cross_validate(
         """The move of p by windows of some weight, and what is then left of every window with its own best state."""
         own = jnp.einsum("wik,wjk->wij", slopes[:, k:], slopes[:, k:]) + jnp.eye(n)
         cross = jnp.einsum("wik,wjk->wij", slopes[:, k:], slopes[:, :k])
-        pull = jnp.einsum("wik,wk->wi", slopes, flat)
+        pull = jnp.einsum("wik,wk->wi", slopes, flat).at[:, k:].add(-scaled)
         toward = jnp.linalg.solve(own, jnp.concatenate([cross, pull[:, k:, None]], -1))
         hessian = jnp.einsum("wik,wjk->wij", slopes[:, :k], slopes[:, :k]) - jnp.einsum(
             "wni,wnj->wij", cross, toward[..., :k]
@@ -253,7 +252,7 @@ def cross_validate(
         return move, left.reshape(r.shape)
 
     def one(out: Array) -> Array:
-        weight = 1.0 - out.astype(flat.dtype)
+        weight = jnp.where(out.all(), 1.0, 1.0 - out)
         left = fit(weight)[1]
         counts = jnp.einsum("w,wro->o", weight, measured.astype(flat.dtype))
         share = jnp.maximum(1.0 - (k + n * weight.sum()) / jnp.maximum(counts.sum(), 1.0), 0.2)

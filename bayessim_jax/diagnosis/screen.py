@@ -68,8 +68,8 @@ class Screened:
 class Screen:
     """Fits of candidates along the motion of a scene; `folds` are windows that are scored by fits to the others."""
 
-    def __init__(self, scene: Scene, folds: Bool[np.ndarray, "folds windows"]) -> None:
-        self.scene, self.folds = scene, jnp.asarray(folds)
+    def __init__(self, scene: Scene, folds: Bool[Array, "folds windows"]) -> None:
+        self.scene, self.folds = scene, folds
         self.shots, self.d, self.slots = scene.shots, scene.d, scene.slots
         self.pairs, self.name, self.takes, self.offsets = scene.pairs, scene.name, scene.takes, scene.offsets
         self.floor = noise_floor(scene.shots)
@@ -135,7 +135,8 @@ class Screen:
             r, slopes = r * (sigma / new), slopes * jnp.broadcast_to(sigma / new, self.shots.y.shape[1:]).reshape(-1)
             sigma = new
         free = jnp.arange(self.d + self.slots) < self.d + self.scene.count(candidate)
-        scores = cross_validate(r, slopes, self.shots.measured, p, free, sigma, self.floor, self.folds)
+        scaled = delta / self.shots.spread
+        scores = cross_validate(r, slopes, self.shots.measured, p, free, sigma, self.floor, self.folds, scaled)
         return Screened(candidate, p, delta, sigma, np.asarray(scores))
 
     def begin(self, z: Float[Array, " d"], sigma: Array) -> Screened:

@@ -16,12 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from bayessim_jax.beliefs.margins import Margins
 from bayessim_jax.inference.shooting import Fit, Predict, Ridge, Shots, profile, residuals, ridge, solve
-
-_residuals = jax.jit(residuals, static_argnums=0)
 
 __all__ = ["DirectPosterior", "estimate_noise", "fit_direct", "sample_direct"]
 
@@ -56,11 +54,10 @@ class DirectPosterior:
     sampler: str = struct.field(pytree_node=False)
 
 
-def estimate_noise(predict: Predict, shots: Shots, fit: Fit, floor: Float[Array, " obs"]) -> Float[Array, " obs"]:
+def estimate_noise(shots: Shots, fit: Fit, floor: Float[Array, " obs"]) -> Float[Array, " obs"]:
     """Noise of every channel from what a fit leaves, √(Σ r² / (n (1 − k/N))) for k numbers fitted to N, or `floor`."""
-    r = np.asarray(_residuals(predict, shots, fit.z, fit.delta, fit.sigma))
     counts = np.asarray(shots.measured).sum((0, 1))
-    squares = (r**2).sum((0, 1)) * np.asarray(fit.sigma) ** 2
+    squares = (np.asarray(fit.misses) ** 2).sum((0, 1))
     return noise_level(squares, counts, fit.z.size + fit.delta.size, floor)
 
 
@@ -98,7 +95,6 @@ def fit_direct(
     shots: Shots,
     d: int,
     *,
-    free: Bool[Array, " d"] | None = None,
     start: Fit | None = None,
     starts: int = STARTS,
     steps: int = 40,
@@ -110,14 +106,14 @@ def fit_direct(
     With `start` only that point is begun from, with its noise.
     """
     windows, n = shots.y.shape[0], shots.spread.size
-    free = jnp.ones(d, bool) if free is None else free
     floor = noise_floor(shots)
+    free = jnp.ones(d, bool)
     run = lambda z, delta, sigma, count: solve(predict, shots, z, delta, sigma, free, steps=count, step=step)  # noqa: E731
     if start is None:
         spread = jnp.asarray(_spreads(shots))
         sigma = jnp.maximum(0.05 * spread, floor)
         delta = jnp.zeros((windows, n))
-        points = jnp.where(free, jax.random.normal(key, (SCREENED, d)), 0.0).at[0].set(0.0)
+        points = jax.random.normal(key, (SCREENED, d)).at[0].set(0.0)
         costs = np.asarray(_screen(predict, shots, points, delta, 0.3 * spread))
         order = np.argsort(np.where(np.isfinite(costs), costs, np.inf))
         chosen = [0, *[int(i) for i in order if i != 0 and np.isfinite(costs[i])][: starts if d else 0]]
@@ -132,7 +128,7 @@ def fit_direct(
     else:
         best = run(start.z, start.delta, start.sigma, steps)
     for _ in range(ROUNDS):
-        sigma = estimate_noise(predict, shots, best, floor)
+        sigma = estimate_noise(shots, best, floor)
         change = float(jnp.abs(jnp.log(sigma / best.sigma)).max())
         best = run(best.z, best.delta, sigma, steps)
         if change < 0.02:
@@ -185,7 +181,7 @@ def sample_direct(
     chi = jax.random.chisquare(chi_key, nu, (DRAWS, 1)) / nu
     white = jax.random.normal(normal_key, (DRAWS, d)) / jnp.sqrt(chi)
     points = fit.z + white @ factor.T
-    around = ridge(predict, shots, fit, step=step)
+    around = ridge(fit)
     log_target = _profiles(predict, shots, around, points)
     log_proposal = -0.5 * (nu + d) * jnp.log1p((white**2).sum(-1) / nu)
     log_weight = log_target - log_proposal

@@ -31,7 +31,7 @@ __all__ = [
     "Fit",
     "Predict",
     "Shots",
-    "linearize",
+    "expand",
     "normal_equations",
     "Ridge",
     "profile",
@@ -91,9 +91,25 @@ class Fit:
     """Of z with every δ eliminated: the inverse of Laplace's covariance."""
     pulls: Float[Array, "windows d"]
     """Every window's part of the gradient of z, its δ eliminated."""
+    r: Float[Array, "windows rows obs"]
+    """(y − prediction) / σ, zero where nothing was measured."""
+    slopes: Float[Array, "windows dn k"]
+    """Derivatives of predictions / σ along (z, δ/S)."""
     cost: Scalar
     steps: Int[Array, ""]
     converged: Bool[Array, ""]
+
+    @property
+    def misses(self) -> Float[Array, "windows rows obs"]:
+        """What was measured less what is predicted, in the channels' units."""
+        return self.r * self.sigma
+
+    @property
+    def along_states(self) -> Float[Array, "windows n k"]:
+        """Derivatives of predictions along δ/S, in the channels' units."""
+        windows, rows, obs = self.r.shape
+        own = self.slopes[:, self.z.size :]
+        return (own.reshape(windows, -1, rows, obs) * self.sigma).reshape(own.shape)
 
 
 def residuals(predict: Predict, shots: Shots, z: Array, delta: Array, sigma: Array) -> Float[Array, "windows rows obs"]:
@@ -122,19 +138,12 @@ def expand(
             ahead, behind = (jax.vmap(lambda m, s=s: prediction(x + s * step * m))(along) for s in (1, -1))
             value, slopes = prediction(x), (ahead - behind) / (2 * step)
         else:
-            value = prediction(x)
-            slopes = jax.vmap(lambda m: jax.jvp(prediction, (x,), (m,))[1])(along)
+            value, slopes = jax.vmap(lambda m: jax.jvp(prediction, (x,), (m,)), out_axes=(None, 0))(along)
         r = jnp.where(measured, (y - value) / sigma, 0.0)
         return r.reshape(-1), jnp.where(measured, slopes / sigma, 0.0).reshape(d + n, -1)
 
     points = jnp.concatenate([jnp.broadcast_to(z, (delta.shape[0], d)), delta], axis=-1)
     return jax.vmap(one)(points, shots.inputs, shots.y, shots.measured)
-
-
-def linearize(predict: Predict, shots: Shots, z: Array, delta: Array, sigma: Array, *, step: float = 0.0) -> Curvature:
-    """The normal equations at a point."""
-    r, slopes = expand(predict, shots, z, delta, sigma, step)
-    return normal_equations(r, slopes, z - shots.center, (delta - shots.shift) / shots.spread)
 
 
 def normal_equations(
@@ -166,6 +175,8 @@ def eliminate(c: Curvature, damping: Scalar | float = 0.0) -> tuple[Array, Array
     return precision, gradient, toward, shift
 
 
+TOLERANCE, DAMPING = 1e-7, 1e-3
+"""Of the solver: the share of the cost that it ends with, and the damping that it begins with."""
 COMPILER_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
 """For programs of small arrays on a CPU: compilation takes half as long, and what comes out is no slower."""
 
@@ -181,13 +192,11 @@ def solve(
     *,
     steps: int | Int[Array, ""] = 30,
     step: float = 0.0,
-    tolerance: float | Scalar = 1e-7,
-    damping: float | Scalar = 1e-3,
 ) -> Fit:
     """Levenberg-Marquardt on (z, δ₁, …, δ_W) from a starting point; z stays as it is where it is not `free`.
 
     A step that does not lower the cost, or leads to a number that is not finite, is refused and shortened. The solver
-    has converged when a step that was accepted lowers the cost by less than `tolerance` of it, or when no step does.
+    has converged when two accepted steps in a row lower the cost by less than 1e-7 of it, or when no step does.
     """
     kind = jnp.result_type(z)
     z, delta, sigma = z.astype(kind), delta.astype(kind), sigma.astype(kind)
@@ -205,29 +214,34 @@ def solve(
         pulls=jnp.zeros((windows, d), kind),
     )
 
+    rest = shots.y.shape[1] * shots.y.shape[2]
+    unseen = (jnp.zeros((windows, rest), kind), jnp.zeros((windows, d + n, rest), kind))
+
     def body(carry: Any) -> Any:
         tried, kept, here, damping, count, small = carry
-        there = linearize(predict, shots, tried[0], tried[1], sigma, step=step)
+        seen = expand(predict, shots, tried[0], tried[1], sigma, step)
+        there = normal_equations(*seen, tried[0] - shots.center, (tried[1] - shots.shift) / shots.spread)
         sound = jnp.isfinite(there.cost) & jnp.isfinite(there.gradient).all() & jnp.isfinite(there.hessian).all()
         better = sound & (there.cost <= here.cost)
         gain = jnp.where(better, (here.cost - there.cost) / jnp.maximum(jnp.abs(here.cost), 1e-12), 1.0)
         gain = jnp.where(jnp.isfinite(gain), gain, 1.0)
-        (z, delta), here = jax.tree.map(lambda x, y: jnp.where(better, x, y), (tried, there), (kept, here))
+        kept, here = jax.tree.map(lambda x, y: jnp.where(better, x, y), ((*tried, *seen), there), (kept, here))
+        z, delta = kept[:2]
         damping = jnp.where(better, jnp.maximum(damping / 5, 1e-9), damping * 8)
         precision, gradient, toward, shift = eliminate(here, damping)
         precision = jnp.where(held, precision, jnp.eye(d)) + damping * jnp.diag(jnp.diagonal(here.hessian))
         move = jnp.where(free, jnp.linalg.solve(precision, jnp.where(free, gradient, 0.0)), 0.0)
         move = move * jnp.minimum(1.0, 2.0 / jnp.maximum(jnp.abs(move).max(initial=0.0), 1e-12))
         moves = (shift - toward @ move) * shots.spread
-        small = jnp.where(better & (gain < tolerance), small + 1, jnp.where(better, 0, small))
-        return (z + move, delta + moves), (z, delta), here, damping.astype(kind), count + 1, small
+        small = jnp.where(better & (gain < TOLERANCE), small + 1, jnp.where(better, 0, small))
+        return (z + move, delta + moves), kept, here, damping.astype(kind), count + 1, small
 
     def more(carry: Any) -> Any:
         _, _, here, damping, count, small = carry
         return (count < steps) & (small < 2) & (damping < 1e9) & (jnp.isfinite(here.cost) | (count == 0))
 
-    start = ((z, delta), (z, delta), nothing, jnp.asarray(damping, kind), jnp.array(0), jnp.array(0))
-    _, (z, delta), here, last, count, small = jax.lax.while_loop(more, body, start)
+    start = ((z, delta), (z, delta, *unseen), nothing, jnp.asarray(DAMPING, kind), jnp.array(0), jnp.array(0))
+    _, (z, delta, r, slopes), here, last, count, small = jax.lax.while_loop(more, body, start)
     precision, _, _, shift = eliminate(here)
     return Fit(
         z=z,
@@ -235,6 +249,8 @@ def solve(
         sigma=sigma,
         precision=jnp.where(held, precision, jnp.eye(d)),
         pulls=jnp.where(free, here.pulls - jnp.einsum("wni,wn->wi", here.cross, shift), 0.0),
+        r=r.reshape(shots.y.shape),
+        slopes=slopes,
         cost=here.cost,
         steps=count,
         converged=(small >= 2) | (last >= 1e9),
@@ -265,13 +281,14 @@ class Ridge:
     inverse: Float[Array, "windows n n"]
 
 
-@partial(jax.jit, static_argnames=("predict", "step"))
-def ridge(predict: Predict, shots: Shots, fit: Fit, *, step: float = 0.0) -> Ridge:
-    """Linearize the initial states at a fit."""
+@jax.jit
+def ridge(fit: Fit) -> Ridge:
+    """What follows of a fit's own linearization."""
     d, n = fit.z.size, fit.delta.shape[-1]
-    toward = eliminate(linearize(predict, shots, fit.z, fit.delta, fit.sigma, step=step))[2]
-    slopes = expand(predict, shots, fit.z, fit.delta, fit.sigma, step)[1][:, d:]
-    return Ridge(fit, toward, slopes, jnp.linalg.inv(jnp.einsum("wik,wjk->wij", slopes, slopes) + jnp.eye(n)))
+    own = fit.slopes[:, d:]
+    inverse = jnp.linalg.inv(jnp.einsum("wik,wjk->wij", own, own) + jnp.eye(n))
+    toward = inverse @ jnp.einsum("wik,wjk->wij", own, fit.slopes[:, :d])
+    return Ridge(fit, toward, own, inverse)
 
 
 def profile(predict: Predict, shots: Shots, ridge: Ridge, z: Float[Array, " d"]) -> Scalar:

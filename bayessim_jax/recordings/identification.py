@@ -144,7 +144,7 @@ def infer_case(
         judged = compare(predictions[name], np.asarray(left.y), np.asarray(left.measured))
         scores[name] = score(judged, spread, scale, model.channels)
     band = np.stack([predict_windows(predict, left, z) for z in posterior.z[:: max(draws // BAND, 1)][:BAND]])
-    around = ridge(predict, shots, fit, step=model.step)
+    around = ridge(fit)
     return CaseInference(
         model=model,
         posterior=posterior,

@@ -1,15 +1,19 @@
 """One simulator that holds every effect: neutral, it is the simulator without them."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from bayessim_jax.diagnosis.bench import Candidate
-from bayessim_jax.diagnosis.procedure import Problem, _folds
+from bayessim_jax.diagnosis.procedure import Problem, _folds, detect
 from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.effects import EFFECTS, Scales
+from bayessim_jax.inference.direct import estimate_noise
 from bayessim_jax.inference.replay import replay_window
+from bayessim_jax.inference.shooting import solve
 from bayessim_jax.recordings.loading import load_case
 from bayessim_jax.recordings.shots import case_model
 from benchmarks.worlds import make_case
@@ -85,11 +89,10 @@ def test_a_candidate_has_its_own_parameters_in_physical_units(problem):
 def test_the_concealed_effect_lowers_the_cost_most(problem):
     bench = problem.bench(problem.pairs)
     sigma = jnp.array([0.02, 0.2])
-    mask = problem.shots.measured
     costs = []
     for k in range(len(problem.pairs)):
         fits = [
-            bench.fit(Candidate((k,)), x, jnp.zeros((mask.shape[0], 2)), sigma, mask)
+            bench.fit(Candidate((k,)), x, jnp.zeros((len(problem.group), 2)), sigma)
             for x in bench.starts(Candidate((k,)), jnp.array([0.0]))
         ]
         costs.append(min(float(fit.cost) for fit in fits))
@@ -109,9 +112,7 @@ def test_the_concealed_effect_comes_out_first_along_the_motion(problem):
     assert max(scores[2:]) < 0.5 * scores[0]
     level = screen.scene.margin[0][0].value(found[0].p[screen.d])
     bench = problem.bench(problem.pairs)
-    fit = bench.fit(
-        Candidate((0,)), found[0].p, jnp.zeros((len(problem.group), 2)), found[0].sigma, problem.shots.measured
-    )
+    fit = bench.fit(Candidate((0,)), found[0].p, jnp.zeros((len(problem.group), 2)), found[0].sigma)
     simulated = bench.values(Candidate((0,)), fit.z)["coulomb_friction@joint/hinge/coulomb"]
     assert float(level) == pytest.approx(simulated, rel=0.05)
 
@@ -124,3 +125,23 @@ def test_every_window_is_scored_by_a_fit_to_others(group):
     assert (folds.sum(1) < len(group)).all()
     if len(set(group)) > 1:
         assert all((fold[group == label] == fold[group == label][0]).all() for fold in folds for label in set(group))
+
+
+def test_scores_are_those_of_fits_without_the_fold(problem):
+    """Linear around one fit to all windows, beside fits to the others, from whose θ each window's state is fitted."""
+    bench, exact = problem.bench(()), np.zeros(len(problem.group))
+    z, still = jnp.zeros(bench.size), jnp.zeros((len(problem.group), 2))
+    baseline = bench.fit(Candidate(), z, still, jnp.array([0.02, 0.2]))
+    entry = detect(jax.random.key(0), problem, baseline.replace(z=baseline.z[:1]))[1]
+    for out in np.array(_folds(problem.group)):
+        kept = dataclasses.replace(problem.shots, measured=problem.shots.measured & ~out[:, None, None])
+        left = dataclasses.replace(problem.shots, measured=problem.shots.measured & out[:, None, None])
+        bench.shots = kept
+        fit = bench.fit(Candidate(), entry.fit.z, entry.fit.delta, entry.fit.sigma, steps=30)
+        sigma = estimate_noise(kept, fit, 0.0 * fit.sigma)
+        shots = dataclasses.replace(left, inputs=bench.setup(Candidate()).inputs)
+        held = jnp.zeros(bench.size, bool)
+        judged = solve(bench.predict, shots, fit.z, entry.fit.delta, sigma, held)
+        logs = -0.5 * judged.r**2 - jnp.log(sigma)
+        exact += np.where(out, np.where(left.measured, logs, 0.0).sum((1, 2)), 0.0)
+    np.testing.assert_allclose(entry.scores, exact, rtol=0.02)

@@ -9,7 +9,7 @@ from bayessim_jax.diagnosis.bench import Bench, Candidate
 from bayessim_jax.diagnosis.experiment import Motions, commands, design
 from bayessim_jax.diagnosis.verdict import Entry
 from bayessim_jax.effects import EFFECTS, Scales
-from bayessim_jax.inference.shooting import Fit
+from bayessim_jax.inference.shooting import solve
 from bayessim_jax.recordings.loading import load_case
 from bayessim_jax.recordings.shots import case_model
 from benchmarks.worlds import make_case
@@ -33,7 +33,8 @@ def rig(tmp_path_factory):
 def member(bench, k):
     x = bench.starts(Candidate((k,)), jnp.array([0.0]))[1]
     delta = jnp.zeros((bench.shots.y.shape[0], 2))
-    fit = Fit(x, delta, jnp.array([0.01, 0.1]), 1e4 * jnp.eye(x.size), 0.0 * x[None], 0.0, 0, True)
+    fit = solve(bench.predict, bench.setup(Candidate((k,))), x, delta, jnp.array([0.01, 0.1]), jnp.zeros(x.size, bool))
+    fit = fit.replace(precision=1e4 * jnp.eye(x.size))
     return Entry(Candidate((k,)), bench.names(Candidate((k,))), fit, np.zeros(1), None)
 
 

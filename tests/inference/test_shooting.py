@@ -7,7 +7,16 @@ import pytest
 
 from bayessim_jax.beliefs.margins import Margins, normal
 from bayessim_jax.inference.direct import fit_direct, noise_floor, sample_direct
-from bayessim_jax.inference.shooting import Shots, eliminate, linearize, profile, ridge, robust_covariance, solve
+from bayessim_jax.inference.shooting import (
+    Shots,
+    eliminate,
+    expand,
+    normal_equations,
+    profile,
+    ridge,
+    robust_covariance,
+    solve,
+)
 
 WINDOWS, ROWS = 6, 12
 SIGMA = 0.3
@@ -71,7 +80,7 @@ def test_a_linear_simulator_has_the_posterior_that_algebra_gives(step):
 
 def test_the_profile_of_a_linear_simulator_is_its_log_posterior():
     shots, _ = line_data(1)
-    around = ridge(line, shots, solved(line, shots))
+    around = ridge(solved(line, shots))
     mean, covariance = exact(shots, SIGMA)
     points = np.random.default_rng(0).normal(size=(5, 2)) + mean
     logs = np.array([profile(line, shots, around, jnp.asarray(p)) for p in points])
@@ -135,7 +144,8 @@ def test_parameters_that_are_not_free_stay():
 
 def test_elimination_leaves_the_same_answer_as_the_whole_system():
     shots, _ = line_data(5)
-    c = linearize(line, shots, jnp.array([0.1, 0.2]), jnp.zeros((WINDOWS, 1)), jnp.array([SIGMA]))
+    z, delta = jnp.array([0.1, 0.2]), jnp.zeros((WINDOWS, 1))
+    c = normal_equations(*expand(line, shots, z, delta, jnp.array([SIGMA])), z, delta)
     precision, gradient, _, _ = eliminate(c)
     whole = np.zeros((2 + WINDOWS, 2 + WINDOWS))
     whole[:2, :2] = c.hessian
