@@ -183,11 +183,11 @@ def resumed(
 def diagnose_drawn(path: Path, case: dict[str, Any], effects: Sequence[Any] | None = None) -> CaseDiagnosis:
     """Diagnose a case that was drawn."""
     from bayessim_jax.recordings.diagnosing import diagnose_case
-    from bayessim_jax.recordings.evaluation import BEFORE_ROWS
+    from bayessim_jax.recordings.evaluation import BEFORE
     from bayessim_jax.recordings.loading import load_case
     from bayessim_jax.recordings.shots import case_model
 
-    model = case_model(load_case(path).check(), before=BEFORE_ROWS)
+    model = case_model(load_case(path).check(), before=BEFORE)
     found = diagnose_case(jax.random.key(case["seed"]), model, effects=effects)
     jax.clear_caches()
     return found

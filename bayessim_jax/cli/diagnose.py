@@ -44,11 +44,11 @@ def diagnose(words: Sequence[str]) -> int:
         import jax
 
         from bayessim_jax.recordings.diagnosing import diagnose_case
-        from bayessim_jax.recordings.evaluation import BEFORE_ROWS
+        from bayessim_jax.recordings.evaluation import BEFORE
         from bayessim_jax.recordings.results import write_diagnosis
         from bayessim_jax.report.diagnose import headline, render
 
-        model = run.model(engine=command.engine, before=BEFORE_ROWS)
+        model = run.model(engine=command.engine, before=BEFORE)
         diagnosis = diagnose_case(jax.random.key(command.seed), model, say=run.say)
         write_diagnosis(run.folder, diagnosis, command.seed)
         run.conclude(render(diagnosis, run.facts), [headline(diagnosis)])

@@ -82,33 +82,38 @@ def force_of(
     return _with_slopes(force, x)
 
 
-@partial(jax.jit, static_argnames=("effect", "kinds", "h", "steps", "before"), compiler_options=COMPILER_OPTIONS)
+@partial(
+    jax.jit, static_argnames=("effect", "kinds", "h", "steps", "before", "coarse"), compiler_options=COMPILER_OPTIONS
+)
 def commands_of(
     effect: Any,
     kinds: Kinds,
     h: float,
     steps: int,
     before: int,
+    coarse: float,
     x: Float[Array, " k"],
     low: Float[Array, " k"],
     high: Float[Array, " k"],
     time: Float[Array, "windows steps"],
     joint: Joint,
     commands: Float[Array, "windows steps act"],
-    gain: Float[Array, ""],
+    older: Float[Array, "windows early act"],
+    gains: Float[Array, " act"],
 ) -> tuple[Float[Array, "windows rows act"], Float[Array, "windows rows act k"]]:
-    """What an `ActEffect` changes in commands, on average over every row, and its derivatives along x.
+    """What an `ActEffect` changes in forces, `gains` times commands, on average over every row; derivatives along x.
 
-    The first `before` time steps come before the window and only fill what the effect remembers.
+    The first `before` of the commands come before the window and only fill what the effect remembers; so do `older`
+    ones from before these, in steps of `coarse` s.
     """
     single = commands.shape[-1] == 1
 
     def change(x: Array) -> Array:
         values = _values(kinds, x, low, high)
 
-        def window(time: Array, joint: Joint, commands: Array) -> Array:
+        def window(time: Array, joint: Joint, commands: Array, older: Array) -> Array:
             def moment(time: Array, joint: Joint) -> Moment:
-                return joint.moment(time, h)._replace(gain=gain)
+                return joint.moment(time, h)._replace(gain=gains[0])
 
             def pick(row: Array) -> Any:
                 return row[0] if single else tuple(row)
@@ -120,13 +125,20 @@ def commands_of(
 
             rows = (time, joint, commands)
             first = jax.tree.map(lambda a: a[0], rows)
-            begun = effect.begin(values, pick(first[2]), moment(*first[:2]))
+            long = bool(len(older)) and not effect.brief
+            begun = effect.begin(values, pick(older[0] if long else first[2]), moment(*first[:2]))
             begun = jax.tree.map(lambda m: jnp.asarray(m, time.dtype), begun)
+            if long:
+                early = moment(*first[:2])._replace(h=coarse, time=time[0] - len(older) * coarse)
+                begun = jax.tree.map(lambda m: m[-1], effect.ahead(values, begun, pick(older.T), early)[1])
             changes = jax.lax.scan(once, begun, rows)[1][before:]
-            return changes.reshape(-1, steps, changes.shape[-1]).mean(1)
+            return gains * changes.reshape(-1, steps, changes.shape[-1]).mean(1)
 
-        return jax.vmap(window)(time, joint, commands)
+        return jax.vmap(window)(*begun, commands, older)
 
+    earlier = jnp.concatenate([time[:, :1] + h * jnp.arange(-before, 0), time], 1)
+    held = jax.tree.map(lambda a: jnp.concatenate([jnp.repeat(a[:, :1], before, 1), a], 1), joint)
+    begun = (earlier, held)
     return _with_slopes(change, x)
 
 

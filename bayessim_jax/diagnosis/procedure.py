@@ -103,7 +103,7 @@ class Problem:
         motion = jax.tree.map(lambda x: x[rows], self.motion)
         shots = dataclasses.replace(self.shots, inputs=None, y=self.shots.y[rows], measured=self.shots.measured[rows])
         scene = Scene(self.system, self.margins, pairs, self.scales, shots, motion, self.step, slots)
-        return Screen(scene, _folds(self.group[rows]))
+        return Screen(scene)
 
     def bench(self, pairs: Sequence[tuple[Any, str]], slots: int = SLOTS) -> Bench:
         """A bench for some of the pairs."""
@@ -198,9 +198,8 @@ def _rank(
             say(f"{k + 1} of {len(screen.pairs)}")
     every.sort(key=lambda begun: -begun.likelihood)
     ended = [screen.finish_candidate(begun, nothing) for begun in every[:FINISHED]]
-    ranked = sorted((e for e in ended if e is not None and np.isfinite(e.score)), key=lambda e: -e.score)
-    without = screen.likelihood(nothing)
-    return ranked, [(screen.name(begun.candidate), begun.likelihood - without) for begun in every]
+    ranked = sorted((e for e in ended if e is not None), key=lambda e: -e.score)
+    return ranked, [(screen.name(begun.candidate), begun.likelihood - nothing.score) for begun in every]
 
 
 def _finalists(screen: Screen, nothing: Screened, ranked: Sequence[Screened]) -> list[Screened]:
@@ -236,7 +235,7 @@ def _pair(screen: Screen, ranked: Sequence[Screened], random: np.random.Generato
         for _, pair in first[:GLANCED]:
             begun = screen.begin_candidate(pair, known, random)
             ended = screen.finish_candidate(begun, known) if begun is not None else None
-            found += [ended] if ended is not None and np.isfinite(ended.score) else []
+            found += [ended] if ended is not None else []
     return sorted(found, key=lambda item: -item.score)
 
 

@@ -179,6 +179,8 @@ def assess(
     were linearized.
     """
     n, k = delta.shape[-1], p.size
+    # steps are linearized along the first of p only, where the rest does not change them
+    lin = replace(lin, along=jnp.pad(lin.along, [(0, 0)] * 3 + [(0, k - lin.along.shape[-1])]))
 
     def one(a: Array, b: Array, along: Array, gap: Array, w: Windowed, f: Forcing, d: Array) -> tuple[Array, Array]:
         forced = gap + jnp.einsum("tnv,tv->tn", b, f.force) + along @ moved
@@ -202,15 +204,20 @@ def assess(
 
 @jax.jit
 def propose(
-    curvature: Curvature, damping: Scalar, free: Bool[Array, " k"], spread: Float[Array, " n"]
+    curvature: Curvature,
+    damping: Scalar,
+    free: Bool[Array, " k"],
+    spread: Float[Array, " n"],
+    p: Float[Array, " k"],
+    delta: Float[Array, "windows n"],
 ) -> tuple[Float[Array, " k"], Float[Array, "windows n"]]:
-    """A Levenberg-Marquardt step of (p, initial states)."""
+    """Where a Levenberg-Marquardt step leads from (p, initial states)."""
     precision, gradient, toward, shift = eliminate(curvature, damping)
     held = jnp.outer(free, free)
     precision = jnp.where(held, precision, jnp.eye(len(free))) + damping * jnp.diag(jnp.diagonal(curvature.hessian))
     move = jnp.linalg.solve(precision, jnp.where(free, gradient, 0.0))
     move = move * jnp.minimum(1.0, 1.0 / jnp.maximum(jnp.abs(move).max(initial=0.0), 1e-12))
-    return move, (shift - toward @ move) * spread
+    return p + move, delta + (shift - toward @ move) * spread
 
 
 @jax.jit
@@ -247,6 +254,7 @@ def cross_validate(
         total = jnp.einsum("w,wij->ij", weight, hessian) + jnp.eye(k)
         move = jnp.linalg.solve(total, jnp.einsum("w,wi->i", weight, gradient) - p)
         move = jnp.where(free, move, 0.0)
+        move = move / jnp.maximum(jnp.abs(move).max(initial=0.0), 1.0)
         state = toward[..., k] - toward[..., :k] @ move
         left = flat - jnp.einsum("wik,i->wk", slopes[:, :k], move) - jnp.einsum("wik,wi->wk", slopes[:, k:], state)
         return move, left.reshape(r.shape)

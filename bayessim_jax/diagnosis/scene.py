@@ -23,6 +23,7 @@ from bayessim_jax.diagnosis.forcing import Joint, commands_of, force_of, restore
 from bayessim_jax.diagnosis.response import Forcing, Linearized, Motion, Windowed, assess, linearize_steps
 from bayessim_jax.effects import Scales, at, with_effects
 from bayessim_jax.effects.drive import CAUTION, actuator_torque, actuators_of, read_numbers
+from bayessim_jax.effects.history import split_history
 from bayessim_jax.effects.places import find_site
 from bayessim_jax.effects.wiring import edit_model
 from bayessim_jax.inference.shooting import Curvature, Shots
@@ -40,7 +41,7 @@ MOVED = 0.15
 class _Around:
     """Steps linearized around a motion, and what effects see of its joints."""
 
-    p: Float[Array, " k"]
+    z: Float[np.ndarray, " d"]
     """Where θ was."""
     motion: Motion
     lin: Linearized
@@ -84,7 +85,7 @@ class Scene:
         self.h = system.dt / self.fine
         self.times = motion.start[:, None] + self.h * jnp.arange(motion.ctrl.shape[1] * self.fine)
         self._around: _Around | None = None
-        self._commands: dict[Any, Array] = {}
+        self._kept: dict[Any, Any] = {}
 
     @property
     def d(self) -> int:
@@ -118,7 +119,7 @@ class Scene:
         return found
 
     def assess(
-        self, candidate: Candidate, p: Float[Array, " k"], delta: Float[Array, "windows n"], sigma: Array
+        self, candidate: Candidate, p: Float[np.ndarray, " k"], delta: Float[Array, "windows n"], sigma: Array
     ) -> tuple[Curvature, Float[Array, "windows rows obs"], Float[Array, "windows kn rowsobs"]]:
         """Normal equations at a point, residuals over σ, and derivatives of what is predicted over σ."""
         motion, readings = self._restored(candidate, p)
@@ -130,7 +131,8 @@ class Scene:
             raw = self._windowed(p, self.motion).seen
             sensed = [(channel, raw[..., channel], *rest) for channel, *rest in readings]
         forcing = _assemble(around.windowed.seen, pushes, sensed, self.model.nv, p.size)
-        moved = jnp.where(jnp.arange(p.size) < self.d, p - around.p, 0.0)
+        moved = np.zeros_like(p)
+        moved[: self.d] = p[: self.d] - around.z
         return assess(around.lin, around.windowed, forcing, moved, p, delta, sigma)
 
     @cached_property
@@ -154,44 +156,43 @@ class Scene:
 
         return numbers
 
-    def _full(self, candidate: Candidate, p: Array) -> tuple[Array, Array]:
-        """The argument of `numbers`, and what of it p moves."""
-        k = self.d + self.slots
+    def _full(self, candidate: Candidate, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The argument of `numbers`, and what of it p moves: θ, and the rest where the candidate edits the model."""
+        edits = any(k in self.edits for k in candidate.effects)
+        k = self.d + (self.slots if edits else 0)
         if self.edited is None:
-            return p[: self.d], jnp.eye(k, self.d)
+            return p[: self.d], np.eye(self.d)
         first = dict(zip(self.edits, np.cumsum([0, *(len(self.parameters[e]) for e in self.edits)]), strict=False))
         flat = [(q, m) for e in self.edits for q, m in zip(self.parameters[e], self.margin[e], strict=True)]
         m = len(flat)
-        here = np.asarray(p)
         x, on = np.zeros(m), np.zeros(m)
         along = np.zeros((k, self.d + 5 * m))
         along[: self.d, : self.d] = np.eye(self.d)
         for e, place in self.offsets(candidate):
             if e in first:
                 own = slice(int(first[e]), int(first[e]) + len(self.parameters[e]))
-                x[own], on[own] = here[place], 1.0
+                x[own], on[own] = p[place], 1.0
                 along[range(place.start, place.stop), range(self.d + own.start, self.d + own.stop)] = 1.0
         low, high = ([getattr(mm, side) for _, mm in flat] for side in ("a", "b"))
         neutral = [q.neutral for q, _ in flat]
-        parts = (here[: self.d], x, on, *(np.asarray(v, float) for v in (low, high, neutral)))
-        return jnp.asarray(np.concatenate(parts)), jnp.asarray(along)
+        parts = (p[: self.d], x, on, *(np.asarray(v, float) for v in (low, high, neutral)))
+        return np.concatenate(parts), along
 
-    def _linearized(self, candidate: Candidate, p: Array, motion: Motion, fresh: bool) -> _Around:
+    def _linearized(self, candidate: Candidate, p: np.ndarray, motion: Motion, fresh: bool) -> _Around:
         """Steps around the motion: those of before, where neither the model nor the motion nor θ has changed much."""
         if not fresh and self._around is not None:
-            change = np.abs(np.asarray(p) - np.asarray(self._around.p))[: self.d]
+            change = np.abs(p[: self.d] - self._around.z)
             if change.max(initial=0.0) < MOVED:
                 return self._around
         full, along = self._full(candidate, p)
         lin = linearize_steps(self.engine, self.numbers, motion, full, along, self.system.substeps, self.step)
-        around = _Around(p, motion, lin, self._windowed(p, motion))
+        around = _Around(p[: self.d], motion, lin, self._windowed(p, motion))
         if not fresh:
             self._around = around
         return around
 
-    def _windowed(self, p: Array, motion: Motion) -> Windowed:
-        ctrl = jnp.concatenate([motion.ctrl, motion.ctrl[:, -1:]], 1)
-        seen, c = _see_all(self.system, self.margins.theta(p[: self.d]), motion.qpos, motion.qvel, ctrl)
+    def _windowed(self, p: np.ndarray, motion: Motion) -> Windowed:
+        seen, c = _see_all(self.system, self.margins, p[: self.d], motion.qpos, motion.qvel, motion.ctrl)
         return Windowed(self.shots.y, self.shots.measured, seen, c, self.shots.spread)
 
     @cached_property
@@ -200,7 +201,7 @@ class Scene:
         acceleration = jnp.asarray(jnp.gradient(self.motion.qvel, self.system.dt, axis=1))
         return acceleration, jnp.asarray(jnp.gradient(acceleration, self.system.dt, axis=1))
 
-    def _restored(self, candidate: Candidate, p: Array) -> tuple[Motion, list[tuple[Any, ...]]]:
+    def _restored(self, candidate: Candidate, p: np.ndarray) -> tuple[Motion, list[tuple[Any, ...]]]:
         """The true motion behind what sensors with effects showed: channel, ∂q/∂x, ∂q/∂reading, place in p."""
         motion, readings = self.motion, []
         for k, place in self.offsets(candidate):
@@ -222,7 +223,7 @@ class Scene:
             readings.append((channels.index(at(name)), along, slope, place.start))
         return motion, readings
 
-    def _pushes(self, e: int, p: Array, place: slice, around: _Around) -> list[tuple[Any, ...]]:
+    def _pushes(self, e: int, p: np.ndarray, place: slice, around: _Around) -> list[tuple[Any, ...]]:
         """What an effect exerts: degree of freedom, force, derivatives along x, place of x in p."""
         effect, site = self.pairs[e][0], self.sites[e]
         if effect.port not in ("force", "act"):
@@ -233,80 +234,91 @@ class Scene:
             other = self._joint(site.other, around, ()) if site.other >= 0 else None
             f, along = force_of(effect, kinds, site.detail, self.h, self.fine, x, low, high, self.times, joint, other)
             return [(self._dof(site.joint), f, along, place.start)]
-        before = 0 if effect.looks else self.motion.past.shape[1] * self.fine
-        times = self.times
-        if before:
-            joint = jax.tree.map(lambda a: jnp.concatenate([jnp.repeat(a[:, :1], before, 1), a], 1), joint)
-            times = self.times[:, :1] + self.h * jnp.arange(-before, self.times.shape[1])
-        gains = [self._gain(actuator, around) for actuator in site.actuators]
-        commands = self._commanded(tuple(site.actuators), before)
-        f, along = commands_of(effect, kinds, self.h, self.fine, before, x, low, high, times, joint, commands, gains[0])
+        gains = self._gains(site.actuators, around)
+        commands, older, coarse, before = self._commands(site.actuators, effect.looks)
+        f, along = commands_of(
+            effect, kinds, self.h, self.fine, before, coarse, x, low, high, self.times, joint, commands, older, gains
+        )
         return [
-            (
-                self._dof(int(self.model.actuator_trnid[actuator, 0])),
-                gain * f[..., i],
-                gain * along[..., i, :],
-                place.start,
-            )
-            for i, (actuator, gain) in enumerate(zip(site.actuators, gains, strict=True))
+            (self._dof(int(self.model.actuator_trnid[actuator, 0])), f[..., i], along[..., i, :], place.start)
+            for i, actuator in enumerate(site.actuators)
         ]
 
     def _dof(self, joint: int) -> int:
         return int(self.model.jnt_dofadr[joint])
 
-    def _numbers_at(self, around: _Around) -> Any:
-        """Numbers of the model, with θ written into them."""
-        return read_numbers(self.model, self.system.engine.writes, self.margins.theta(around.p[: self.d]))
-
-    def _gain(self, actuator: int, around: _Around) -> Array:
-        """Force on its joint for a command of one."""
-        key = ("gain", actuator)
+    def _gains(self, actuators: Sequence[int], around: _Around) -> Float[np.ndarray, " act"]:
+        """Forces on their joints for commands of one."""
+        key = ("gains", tuple(actuators))
         if key not in around.kept:
-            read = self._numbers_at(around)
-            gain = read("actuator_gear", actuator, 0) * read("actuator_gainprm", actuator, 0)
-            around.kept[key] = jnp.asarray(gain, float)
+            theta = self.margins.theta(jnp.asarray(around.z))
+            read = read_numbers(self.model, self.system.engine.writes, theta)
+            gains = [read("actuator_gear", i, 0) * read("actuator_gainprm", i, 0) for i in actuators]
+            around.kept[key] = np.array([float(gain) for gain in gains])
         return around.kept[key]
 
-    def _commanded(self, actuators: tuple[int, ...], before: int) -> Float[Array, "windows steps act"]:
-        """Commands of every time step within their limits, those before the window first."""
-        if (actuators, before) not in self._commands:
-            past, ctrl = self.motion.past, self.motion.ctrl
-            rows = jnp.concatenate([past, ctrl], 1) if before else ctrl
-            limits = [self.model.actuator_ctrlrange[i] for i in actuators]
-            limited = [bool(self.model.actuator_ctrllimited[i]) for i in actuators]
-            low, high = (
-                np.array([r[k] if on else bound for r, on in zip(limits, limited, strict=True)])
-                for k, bound in ((0, -np.inf), (1, np.inf))
-            )
-            self._commands[actuators, before] = jnp.repeat(
-                jnp.clip(rows[..., list(actuators)], low, high), self.fine, 1
-            )
-        return self._commands[actuators, before]
+    def _commands(self, actuators: Sequence[int], looks: bool) -> tuple[Array, Array, float, int]:
+        """Commands of every time step within their limits; those further back, their step, s; how many come before."""
+        key = (tuple(actuators), looks)
+        if key not in self._kept:
+            older, coarse, recent = split_history(self.motion.past, self.system.dt)
+            rows = self.motion.ctrl if looks else jnp.concatenate([recent, self.motion.ctrl], 1)
+            commands = jnp.repeat(self._limited(rows, actuators), self.fine, 1)
+            before = 0 if looks else recent.shape[1] * self.fine
+            self._kept[key] = commands, self._limited(older, actuators), coarse, before
+        return self._kept[key]
+
+    def _limited(self, rows: Float[Array, "windows rows nu"], actuators: Sequence[int]) -> Array:
+        """Commands of some actuators within their limits."""
+        limits = [self.model.actuator_ctrlrange[i] for i in actuators]
+        limited = [bool(self.model.actuator_ctrllimited[i]) for i in actuators]
+        low, high = (
+            np.array([r[k] if on else bound for r, on in zip(limits, limited, strict=True)])
+            for k, bound in ((0, -np.inf), (1, np.inf))
+        )
+        return jnp.clip(rows[..., list(actuators)], low, high)
 
     def _joint(self, joint: int, around: _Around, actuators: Sequence[int]) -> Joint:
         """What effects see of a joint; the drive is that of some actuators, or of all that the joint has."""
-        key = (joint, tuple(actuators))
+        driving = tuple(actuators) or tuple(actuators_of(self.model, joint))
+        key = (joint, driving)
         if key not in around.kept:
-            around.kept[key] = self._look_at(joint, around, tuple(actuators) or actuators_of(self.model, joint))
+            place = int(self.model.jnt_qposadr[joint]), self._dof(joint)
+            around.kept[key] = _look_at(
+                self.system, self.margins, place, driving, self.fine, around.z, around.motion, around.lin
+            )
         return around.kept[key]
 
-    def _look_at(self, joint: int, around: _Around, actuators: Sequence[int]) -> Joint:
-        motion, lin = around.motion, around.lin
-        q, v, nv = int(self.model.jnt_qposadr[joint]), self._dof(joint), self.model.nv
-        inertia = CAUTION * self.system.dt / jnp.maximum(lin.b[..., nv + v, v], 1e-12)
-        rise = lin.gap[..., nv + v] + motion.qvel[:, 1:, v] - motion.qvel[:, :-1, v]
-        position, velocity = self._between(motion.qpos[..., q]), self._between(motion.qvel[..., v])
-        drive, numbers = jnp.zeros_like(position), self._numbers_at(around)
-        for i in actuators:
-            command = jnp.repeat(motion.ctrl[..., i], self.fine, axis=1)
-            drive = drive + actuator_torque(self.model, numbers, i, command, position, velocity)
-        fine = lambda rows: jnp.repeat(rows, self.fine, axis=1)  # noqa: E731
-        return Joint(position, velocity, fine(rise / self.system.dt), fine(inertia), drive)
 
-    def _between(self, rows: Float[Array, "windows rows"]) -> Float[Array, "windows steps"]:
+@partial(jax.jit, static_argnames=("place", "actuators", "fine"))
+def _look_at(
+    system: MjcfSystem,
+    margins: Margins,
+    place: tuple[int, int],
+    actuators: tuple[int, ...],
+    fine: int,
+    z: Array,
+    motion: Motion,
+    lin: Linearized,
+) -> Joint:
+    """What effects see of the joint whose place is in qpos and qvel."""
+    q, v = place
+    engine, nv = system.engine, system.engine.model.nv
+
+    def between(rows: Float[Array, "windows rows"]) -> Float[Array, "windows steps"]:
         """On a line between rows."""
-        f = jnp.arange(self.fine) / self.fine
+        f = jnp.arange(fine) / fine
         return (rows[:, :-1, None] * (1 - f) + rows[:, 1:, None] * f).reshape(len(rows), -1)
+
+    inertia = CAUTION * system.dt / jnp.maximum(lin.b[..., nv + v, v], 1e-12)
+    rise = lin.gap[..., nv + v] + motion.qvel[:, 1:, v] - motion.qvel[:, :-1, v]
+    position, velocity = between(motion.qpos[..., q]), between(motion.qvel[..., v])
+    drive, numbers = jnp.zeros_like(position), read_numbers(engine.model, engine.writes, margins.theta(z))
+    for i in actuators:
+        command = jnp.repeat(motion.ctrl[..., i], fine, axis=1)
+        drive = drive + actuator_torque(engine.model, numbers, i, command, position, velocity)
+    acceleration, inertia = (jnp.repeat(rows, fine, axis=1) for rows in (rise / system.dt, inertia))
+    return Joint(position, velocity, acceleration, inertia, drive)
 
 
 @partial(jax.jit, static_argnames=("nv", "size"))
@@ -353,6 +365,10 @@ def _see_one(system: MjcfSystem, theta: Array, qpos: Array, qvel: Array, ctrl: A
 
 
 @jax.jit
-def _see_all(system: MjcfSystem, theta: Array, qpos: Array, qvel: Array, ctrl: Array) -> tuple[Array, Array]:
+def _see_all(
+    system: MjcfSystem, margins: Margins, z: Array, qpos: Array, qvel: Array, ctrl: Array
+) -> tuple[Array, Array]:
+    """What the sensors show along a motion, and its derivatives along the state; the last command stays."""
+    theta, held = margins.theta(z), jnp.concatenate([ctrl, ctrl[:, -1:]], 1)
     one = lambda q, v, u: _see_one(system, theta, q, v, u)  # noqa: E731
-    return jax.vmap(jax.vmap(one))(qpos, qvel, ctrl)
+    return jax.vmap(jax.vmap(one))(qpos, qvel, held)

@@ -1,7 +1,7 @@
 """Every effect at every place held against what was measured, along the recorded motion and without simulating it.
 
 A candidate is fitted with θ and the initial states of all windows by `diagnosis.response`, with the force that it
-exerts along the motion by `diagnosis.forcing`, and scored on recordings that its fit has not seen. One fit takes
+exerts along the motion by `diagnosis.forcing`. One fit takes
 hundredths of a second, so that pairs are tried as well. What comes out on top is then simulated (`diagnosis.bench`).
 """
 
@@ -9,14 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import chain, product
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
+from scipy.stats import norm
 
 from bayessim_jax.diagnosis.bench import NEAR, Candidate, begin_value
-from bayessim_jax.diagnosis.response import cross_validate, propose
+from bayessim_jax.diagnosis.response import propose
 from bayessim_jax.diagnosis.scene import Scene
 from bayessim_jax.diagnosis.whiteness import Misfit, judge_misfit
 from bayessim_jax.inference.direct import noise_floor, noise_level
@@ -24,16 +26,21 @@ from bayessim_jax.inference.direct import noise_floor, noise_level
 __all__ = ["Begun", "Screen", "Screened"]
 
 ITERATIONS = 6
-BEGINNING, KEPT, LASTING = 8, 2, 8
-"""Steps of the solver from every point that a candidate is begun from, how many go on, and their further steps."""
+RACES = ((3, False, 4), (4, True, 2), (6, True, 2))
+"""Steps of the solver from the points that a candidate is begun from, whether parameters that are scanned move, and how
+many points go on; one race after the other."""
+LASTING = 8
+"""Further steps of those that went on."""
 LEAST_SHARE = 0.2
 """Of the numbers measured, that noise is taken to have in the residuals however many are fitted."""
 GLANCING = 6
 """Steps of the solver from each of two points, by which partners of a known effect are ranked."""
-MOMENTS, CLOCK = 8, 2.0
-"""Times that are tried for what happens at some time; a parameter in s that may be so many windows long is a time."""
-DRAWS = 3
-"""Points of its prior from which a candidate of several parameters is begun, beside the usual ones."""
+STRAYED = 1.5
+"""Of θ's z: where the simulator without an effect was driven further out, a candidate also begins from the middle."""
+DRAWS = 4
+"""Points of its prior from which a candidate of several parameters is begun beside the usual ones."""
+EDGE = 0.02
+"""Share of a prior at either end where nothing begins."""
 
 
 @dataclass
@@ -56,23 +63,19 @@ class Screened:
     """[θ's z, the candidate's x, zeros in the places that are not used]."""
     delta: Float[Array, "windows n"]
     sigma: Float[Array, " obs"]
-    scores: Float[np.ndarray, " windows"]
-    """Log predictive density of every window."""
-
-    @property
-    def score(self) -> float:
-        """Sum over windows."""
-        return float(self.scores.sum())
+    score: float
+    """Log likelihood at its own noise, less one for every parameter (Akaike 1974), up to a constant."""
 
 
 class Screen:
-    """Fits of candidates along the motion of a scene; `folds` are windows that are scored by fits to the others."""
+    """Fits of candidates along the motion of a scene."""
 
-    def __init__(self, scene: Scene, folds: Bool[Array, "folds windows"]) -> None:
-        self.scene, self.folds = scene, folds
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
         self.shots, self.d, self.slots = scene.shots, scene.d, scene.slots
         self.pairs, self.name, self.takes, self.offsets = scene.pairs, scene.name, scene.takes, scene.offsets
         self.floor = noise_floor(scene.shots)
+        self.counts = np.maximum(np.asarray(scene.shots.measured).sum((0, 1)), 1)
 
     def starts(self, candidate: Candidate, random: np.random.Generator) -> list[np.ndarray]:
         """Points of a candidate's x to begin from: its start values, mirrored where a sign is open, and draws."""
@@ -82,27 +85,43 @@ class Screen:
         points = [begin]
         if any(p.low < 0.0 for p, _ in each):
             points.append(-begin)
-        clocks = [k for k, (p, _) in enumerate(each) if p.unit == "s" and p.high > CLOCK * self.scene.length]
-        for centre in np.linspace(0.0, 1.0, MOMENTS + 2)[1:-1] if clocks else ():
+        grids = []
+        for unit in dict.fromkeys(p.unit for p, _ in each if p.scan):
+            together = [k for k, (p, _) in enumerate(each) if p.scan and p.unit == unit]
+            shares = (np.arange(each[together[0]][0].scan) + 1.0) / (each[together[0]][0].scan + 1.0)
+            apart = (np.arange(len(together)) - 0.5 * (len(together) - 1)) / len(shares)
+            places = norm.ppf(np.clip(shares[:, None] + apart, EDGE, 1.0 - EDGE))
+            grids.append([list(zip(together, place, strict=True)) for place in places])
+        for chosen in product(*grids) if grids else ():
             point = begin.copy()
-            for i, k in enumerate(clocks):
-                p, m = each[k]
-                when = centre + (2 * i - len(clocks) + 1) / (2 * MOMENTS)
-                point[k] = float(m.standard(jnp.asarray(p.low + when * (p.high - p.low), float)))
+            for k, z in chain(*chosen):
+                point[k] = z
             points.append(point)
-        if len(each) > 1 and not clocks:
-            points += [0.7 * random.standard_normal(len(each)) for _ in range(DRAWS)]
+        if len(each) > 1:
+            points += [random.standard_normal(len(each)) for _ in range(DRAWS)]
         return points
 
     def fit(
-        self, candidate: Candidate, p: Float[Array, " k"], delta: Array, sigma: Array, iterations: int = ITERATIONS
+        self,
+        candidate: Candidate,
+        p: Float[Array, " k"] | np.ndarray,
+        delta: Array,
+        sigma: Array,
+        iterations: int = ITERATIONS,
+        scanned: bool = True,
     ) -> tuple[Any, ...]:
-        """Levenberg-Marquardt from a point; returns (p, δ, curvature, residuals, slopes)."""
-        free = jnp.arange(self.d + self.slots) < self.d + self.scene.count(candidate)
+        """Levenberg-Marquardt from a point; parameters that are `scanned` may stay where they are.
+
+        Returns (p, δ, curvature, residuals, slopes).
+        """
+        free = np.arange(self.d + self.slots) < self.d + self.scene.count(candidate)
+        if not scanned:
+            for effect, place in self.offsets(candidate):
+                free[place] = [not q.scan for q in self.scene.parameters[effect]]
         damping = 1e-3
         here: Any = None
-        tried = (p, delta)
-        for _ in range(iterations):
+        tried = (np.asarray(p), delta)
+        for k in range(iterations):
             there = self.scene.assess(candidate, *tried, sigma)
             cost = float(there[0].cost)
             if np.isfinite(cost) and (here is None or cost <= float(here[2].cost)):
@@ -114,34 +133,35 @@ class Screen:
                 break
             else:
                 damping *= 10
-            move, moves = propose(here[2], damping, free, self.shots.spread)
-            tried = (here[0] + move, here[1] + moves)
+            if k + 1 < iterations:
+                p, delta = propose(here[2], damping, free, self.shots.spread, *here[:2])
+                tried = (np.asarray(p), delta)
         return here if here is not None else (p, delta, None, None, None)
 
     def settle(
-        self, candidate: Candidate, p: Array, delta: Array, sigma: Array, rounds: int = 2, iterations: int = ITERATIONS
+        self,
+        candidate: Candidate,
+        p: Float[Array, " k"] | np.ndarray,
+        delta: Array,
+        sigma: Array,
+        rounds: int = 2,
+        iterations: int = ITERATIONS,
     ) -> Screened | None:
         """Fit a candidate and its noise in turn, and score it."""
-        measured = np.asarray(self.shots.measured)
-        counts = np.maximum(measured.sum((0, 1)), 1)
-        fitted = self.d + self.scene.count(candidate) + delta.size
-        r = slopes = None
+        own = self.scene.count(candidate)
         for k in range(rounds):
-            p, delta, curvature, r, slopes = self.fit(candidate, p, delta, sigma, iterations if k == 0 else 3)
+            p, delta, curvature, r, _ = self.fit(candidate, p, delta, sigma, iterations if k == 0 else 3)
             if curvature is None:
                 return None
             squares = (np.asarray(r) ** 2).sum((0, 1)) * np.asarray(sigma) ** 2
-            new = noise_level(squares, counts, fitted, self.floor, LEAST_SHARE)
-            r, slopes = r * (sigma / new), slopes * jnp.broadcast_to(sigma / new, self.shots.y.shape[1:]).reshape(-1)
-            sigma = new
-        free = jnp.arange(self.d + self.slots) < self.d + self.scene.count(candidate)
-        scaled = delta / self.shots.spread
-        scores = cross_validate(r, slopes, self.shots.measured, p, free, sigma, self.floor, self.folds, scaled)
-        return Screened(candidate, p, delta, sigma, np.asarray(scores))
+            level = noise_level(squares, self.counts, self.d + own + delta.size, self.floor, LEAST_SHARE)
+            score, sigma = self._profile(r, sigma) - own, level
+        return Screened(candidate, jnp.asarray(p), delta, sigma, score) if np.isfinite(score) else None
 
     def begin(self, z: Float[Array, " d"], sigma: Array) -> Screened:
         """The simulator without effects."""
-        p = jnp.zeros(self.d + self.slots).at[: self.d].set(z)
+        p = np.zeros(self.d + self.slots)
+        p[: self.d] = z
         delta = jnp.zeros((len(self.scene.motion.start), 2 * self.scene.model.nv))
         found = self.settle(Candidate(), p, delta, sigma)
         if found is None:
@@ -152,23 +172,23 @@ class Screen:
         """Fit a candidate from several points beside a fit without it; `known` may hold some of its effects already."""
         held = dict(self.offsets(known.candidate))
         added = Candidate(tuple(k for k in candidate.effects if k not in held))
-        own, ends = dict(self.offsets(added)), []
-        for start in self.starts(added, random):
-            p = self._put(candidate, known, held, own, start)
-            ends.append(self.fit(candidate, p, known.delta, known.sigma, BEGINNING))
-        ends = sorted((end for end in ends if end[2] is not None), key=lambda end: float(end[2].cost))[:KEPT]
+        new = dict(self.offsets(added))
+        points = [self._put(candidate, known, held, new, start) for start in self.starts(added, random)]
+        strayed = (np.arange(self.d + self.slots) < self.d) & (np.abs(known.p) > STRAYED)
+        if strayed.any():
+            points += [np.where(strayed, 0.0, point) for point in points]
+        ends: list[tuple[Any, ...]] = [(p, known.delta) for p in points]
+        for steps, scanned, kept in RACES:
+            tried = [self.fit(candidate, end[0], end[1], known.sigma, steps, scanned) for end in ends]
+            ends = sorted((end for end in tried if end[2] is not None), key=lambda end: float(end[2].cost))[:kept]
         if not ends:
             return None
         return Begun(candidate, ends, self._profile(ends[0][3], known.sigma))
 
-    def likelihood(self, found: Screened) -> float:
-        """Log likelihood of a fit at its own noise, up to a constant."""
-        return self._profile(self.scene.assess(found.candidate, found.p, found.delta, found.sigma)[1], found.sigma)
-
     def _profile(self, r: Array, sigma: Array) -> float:
-        counts = np.maximum(np.asarray(self.shots.measured).sum((0, 1)), 1)
-        rms = np.sqrt((np.asarray(r) ** 2).sum((0, 1)) / counts) * np.asarray(sigma)
-        return -float((counts * np.log(np.maximum(rms, np.asarray(self.floor)))).sum())
+        """Log likelihood at the noise that residuals have, up to a constant."""
+        rms = np.sqrt((np.asarray(r) ** 2).sum((0, 1)) / self.counts) * np.asarray(sigma)
+        return -float((self.counts * np.log(np.maximum(rms, np.asarray(self.floor)))).sum())
 
     def finish_candidate(self, begun: Begun, known: Screened) -> Screened | None:
         """Fit what was begun to the end, with its own noise, and score it."""
@@ -181,7 +201,7 @@ class Screen:
 
     def misfit(self, key: PRNGKeyArray, found: Screened) -> Misfit:
         """What a candidate leaves of the misfit."""
-        _, r, slopes = self.scene.assess(found.candidate, found.p, found.delta, found.sigma)
+        _, r, slopes = self.scene.assess(found.candidate, np.asarray(found.p), found.delta, found.sigma)
         n = found.delta.shape[-1]
         unscaled = slopes[:, -n:].reshape(len(slopes), n, *r.shape[1:]) * found.sigma
         residual = np.asarray(r * found.sigma)
@@ -208,10 +228,10 @@ class Screen:
         held: Mapping[int, slice],
         own: Mapping[int, slice],
         start: np.ndarray,
-    ) -> Array:
+    ) -> np.ndarray:
         """A candidate's p, with what is known of some of its effects and a start for the others."""
-        p = jnp.zeros(self.d + self.slots).at[: self.d].set(known.p[: self.d])
+        p = np.zeros(self.d + self.slots)
+        p[: self.d] = known.p[: self.d]
         for k, place in self.offsets(candidate):
-            x = known.p[held[k]] if k in held else jnp.asarray(start[own[k].start - self.d : own[k].stop - self.d])
-            p = p.at[place].set(x)
+            p[place] = known.p[held[k]] if k in held else start[own[k].start - self.d : own[k].stop - self.d]
         return p

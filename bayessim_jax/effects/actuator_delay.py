@@ -9,12 +9,11 @@ import jax.numpy as jnp
 
 from bayessim_jax.contracts import Scalar
 from bayessim_jax.effects.contract import ActEffect, EffectParameter, Memory, Moment, Scales, Values
+from bayessim_jax.effects.history import RECENT
 
 __all__ = ["ActuatorDelay"]
 
-LONGEST = 0.1
-"""The longest delay, s; what is remembered is as long."""
-MOST = 100
+MOST = 400
 """The most time steps that are remembered, which makes the longest delay shorter where time steps are short."""
 
 
@@ -27,6 +26,7 @@ class ActuatorDelay(ActEffect):
 
     name = "actuator_delay"
     hurries = True
+    brief = True
 
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The delay T."""
@@ -35,21 +35,20 @@ class ActuatorDelay(ActEffect):
 
     def begin(self, values: Values, command: Any, moment: Moment) -> Memory:
         """The command as if it had always been the same, the latest first."""
-        return (command,) * samples_back(moment.h)
+        return jnp.full(samples_back(moment.h), command)
 
     def command(self, values: Values, memory: Memory, command: Any, moment: Moment) -> tuple[Any, Memory]:
         """The command T ago."""
-        samples = (command, *memory)
+        samples = jnp.concatenate([jnp.asarray(command)[None], memory])
         whole, rest = _split(values["seconds"] / moment.h, len(memory))
-        late = 0.0
-        for k, sample in enumerate(samples):
-            late = late + jnp.where(whole == k, 1.0 - rest, jnp.where(whole == k - 1, rest, 0.0)) * sample
-        return late, samples[:-1]
+        place = jnp.arange(len(samples))
+        share = jnp.where(place == whole, 1.0 - rest, jnp.where(place == whole + 1.0, rest, 0.0))
+        return share @ samples, samples[:-1]
 
     def ahead(self, values: Values, memory: Memory, commands: Any, moment: Moment) -> tuple[Any, Memory]:
         """Shifted by one bit of k after the other, so that nothing is looked up."""
         back, count = len(memory), len(commands)
-        samples = jnp.concatenate([jnp.stack(memory[::-1]), commands])
+        samples = jnp.concatenate([memory[::-1], commands])
         whole, rest = _split(values["seconds"] / moment.h, back)
         late, bit = jnp.concatenate([samples[:1], samples]), 1
         whole = whole.astype(int)
@@ -58,12 +57,13 @@ class ActuatorDelay(ActEffect):
             late = jnp.where(whole & bit, shifted, late)
             bit *= 2
         new = late[-count:] + rest * (late[-count - 1 : -1] - late[-count:])
-        return new, tuple(samples[back - k : back - k + count] for k in range(back))
+        places = back + jnp.arange(count)[:, None] - jnp.arange(back)
+        return new, samples[places]
 
 
 def samples_back(h: float) -> int:
     """How many earlier time steps are remembered."""
-    return min(math.ceil(LONGEST / h - 1e-9), MOST)
+    return min(math.ceil(RECENT / h - 1e-9), MOST)
 
 
 def _split(steps: Scalar, back: int) -> tuple[Scalar, Scalar]:

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from bayessim_jax.contracts import Box, Scalar
 from bayessim_jax.effects.contract import Moment, Number, Numbers
 from bayessim_jax.effects.drive import CAUTION, actuator_torque, actuators_of, probe_inertia, read_numbers
+from bayessim_jax.effects.history import split_history
 from bayessim_jax.effects.places import Site
 from bayessim_jax.effects.wiring import Wired, edit_model
 from bayessim_jax.engines.contract import Engine
@@ -454,11 +455,25 @@ class AugmentedMjcf:
     def _warm(
         self, theta: Float[Array, " d"], numbers: Numbers, state: AugmentedState, past: Actions
     ) -> AugmentedState:
-        """The memories of the actuators' effects after past commands; those that look at the joint are left alone."""
-        begun = replace(state, time=state.time - len(past) * self.dt)
+        """The memories of the actuators' effects after past commands; those that look at the joint are left alone.
+
+        What lies long back goes in longer steps, past effects that have not forgotten it.
+        """
         blind = frozenset(k for k, w in self._at("act") if not w.effect.looks)
-        _, later = self._pass_early(theta, numbers, begun, past, blind)
-        last = jax.tree.map(lambda x: x[-1], later)
+        long = frozenset(k for k in blind if not self.effects[k].effect.brief)
+        older, h, past = split_history(past, self.dt)
+        if len(older) and long:
+            begun = replace(state, time=state.time - len(past) * self.dt - len(older) * h)
+            afresh = self._begin_commands(theta, numbers, state, past[0])
+            long_ago = self._remember(state, self._pass_early(theta, numbers, begun, older, long, h)[1])
+            pairs = enumerate(zip(long_ago.memories, afresh.memories, strict=True))
+            state = replace(state, memories=tuple(old if k in long else new for k, (old, new) in pairs))
+        begun = replace(state, time=state.time - len(past) * self.dt)
+        return self._remember(state, self._pass_early(theta, numbers, begun, past, blind)[1])
+
+    def _remember(self, state: AugmentedState, later: Mapping[int, Any]) -> AugmentedState:
+        """The state with the last of some effects' memories."""
+        last = jax.tree.map(lambda x: x[-1], dict(later))
         return replace(state, memories=tuple(last.get(k, memory) for k, memory in enumerate(state.memories)))
 
     def _early(self) -> frozenset[int]:
@@ -486,18 +501,23 @@ class AugmentedMjcf:
         state: AugmentedState,
         actions: Actions,
         early: frozenset[int],
+        h: float = 0.0,
     ) -> tuple[Float[Array, "periods steps act"], dict[int, Any]]:
-        """What has become of the commands at each time step, and the memories after each period."""
-        rows = jnp.repeat(actions, self.substeps, axis=0) if self.substeps > 1 else actions
+        """What has become of the commands at each time step, and the memories after each period.
+
+        With `h` a period is one step of that length.
+        """
+        substeps = 1 if h else self.substeps
+        rows = jnp.repeat(actions, substeps, axis=0) if substeps > 1 else actions
         columns = self._limit(numbers, rows)
         later = {}
         for k in sorted(early):
-            w, moment = self.effects[k], Moment(state.time, self._h)
+            w, moment = self.effects[k], Moment(state.time, h or self._h)
             new, memory = w.effect.ahead(w.values(theta), state.memories[k], _pick(columns, w.site), moment)
             for actuator, value in zip(w.site.actuators, new if isinstance(new, tuple) else (new,), strict=True):
                 columns[actuator] = value
-            later[k] = jax.tree.map(lambda x: x[self.substeps - 1 :: self.substeps], memory)
-        return jnp.stack(columns, -1).reshape(-1, self.substeps, self.actions.size), later
+            later[k] = jax.tree.map(lambda x: x[substeps - 1 :: substeps], memory)
+        return jnp.stack(columns, -1).reshape(-1, substeps, self.actions.size), later
 
     def _replay_rows(
         self,

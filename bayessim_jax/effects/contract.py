@@ -112,6 +112,11 @@ class EffectParameter:
     start: float
     log: bool = False
     """Whether a fit is better done in its logarithm; `low` is then above 0."""
+    scan: int = 0
+    """So many values, spread evenly over the range, are begun from, because the likelihood may have many maxima.
+
+    Parameters of one unit go together, such as the beginning and the end of an event.
+    """
 
     def __post_init__(self) -> None:
         if not self.low < self.start < self.high:
@@ -182,6 +187,8 @@ class ActEffect(Effect, Protocol):
     """Whether it looks at position or velocity; what does not can be worked out before the simulation."""
     hurries: bool = False
     """Whether `ahead` is quicker than `command` at every time step."""
+    brief: bool = False
+    """Whether it remembers no more than `history.RECENT` s of commands; other memories do not depend on the step."""
 
     def choose(self, names: Sequence[str]) -> list[str]:
         """The places among actuators of these names: each of them, unless it takes several."""

@@ -30,8 +30,8 @@ class DisturbanceEvent(ForceEffect):
         """t₀, t₁ and P."""
         duration, impulse = scales.duration, 4.0 * scales.inertia * scales.speed
         return (
-            EffectParameter("start", "s", 0.0, duration, 0.45 * duration, 0.45 * duration),
-            EffectParameter("end", "s", 0.0, duration, 0.55 * duration, 0.55 * duration),
+            EffectParameter("start", "s", 0.0, duration, 0.45 * duration, 0.45 * duration, scan=8),
+            EffectParameter("end", "s", 0.0, duration, 0.55 * duration, 0.55 * duration, scan=8),
             EffectParameter("impulse", f"{scales.force_unit} s", -impulse, impulse, 0.0, 0.05 * impulse),
         )
 

@@ -37,7 +37,7 @@ class Hysteresis(ForceEffect):
         return (
             EffectParameter("stiffness", f"{scales.force_unit}/{scales.unit}", 0.0, 5.0 * k, 0.0, 0.1 * k),
             EffectParameter("A", "", 0.2, 5.0, 1.0, 1.0, log=True),
-            EffectParameter("beta", f"{scales.unit}⁻ⁿ", 0.01 * bend, 100.0 * bend, bend, bend, log=True),
+            EffectParameter("beta", f"{scales.unit}⁻ⁿ", 0.01 * bend, 100.0 * bend, bend, bend, log=True, scan=4),
             EffectParameter("gamma", f"{scales.unit}⁻ⁿ", -0.9 * bend, 10.0 * bend, 0.0, 0.1 * bend),
             EffectParameter("n", "", 1.0, 3.0, 1.0, 1.1),
         )

@@ -33,7 +33,7 @@ class JointFlexibility(ForceEffect):
         first = min(0.1 * damping, 0.2 * (start * inertia) ** 0.5)
         unit = f"{scales.force_unit}/{scales.unit}"
         return (
-            EffectParameter("stiffness", unit, 0.01 * start, high, start, start, log=True),
+            EffectParameter("stiffness", unit, 0.01 * start, high, start, start, log=True, scan=6),
             EffectParameter("damping", f"{scales.force_unit} s/{scales.unit}", 0.0, damping, 0.0, first),
             EffectParameter("rotor_inertia", scales.inertia_unit, 0.0, 2.0 * inertia, 0.0, 0.1 * inertia),
         )

@@ -23,7 +23,7 @@ class SensorOffset(SenseEffect):
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The offset q₀."""
         reach = scales.position
-        return (EffectParameter("offset", scales.unit, -0.5 * reach, 0.5 * reach, 0.0, 0.03 * reach),)
+        return (EffectParameter("offset", scales.unit, -0.5 * reach, 0.5 * reach, 0.0, 0.03 * reach, scan=4),)
 
     def sense(self, values: Values, memory: Memory, reading: Scalar, moment: Moment) -> Scalar:
         """The sum q + q₀."""

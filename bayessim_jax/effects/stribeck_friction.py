@@ -34,7 +34,9 @@ class StribeckFriction(ForceEffect):
         return (
             EffectParameter("coulomb", scales.force_unit, 0.0, force, 0.0, 0.1 * force),
             EffectParameter("static", scales.force_unit, 0.0, 1.5 * force, 0.0, 0.2 * force),
-            EffectParameter("velocity", f"{scales.unit}/s", 1e-3 * speed, speed, 0.1 * speed, 0.1 * speed, log=True),
+            EffectParameter(
+                "velocity", f"{scales.unit}/s", 1e-3 * speed, speed, 0.1 * speed, 0.1 * speed, log=True, scan=3
+            ),
         )
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:

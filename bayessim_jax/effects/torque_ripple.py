@@ -28,8 +28,8 @@ class TorqueRipple(ForceEffect):
         force = scales.force
         return (
             EffectParameter("amplitude", scales.force_unit, 0.0, force, 0.0, 0.1 * force),
-            EffectParameter("cycles", "", turns, 100.0 * turns, 6.0 * turns, 6.0 * turns, log=True),
-            EffectParameter("phase", "rad", -math.pi, math.pi, 0.0, 0.0),
+            EffectParameter("cycles", "", turns, 100.0 * turns, 6.0 * turns, 6.0 * turns, log=True, scan=20),
+            EffectParameter("phase", "rad", -1.5 * math.pi, 1.5 * math.pi, 0.0, 0.0, scan=3),
         )
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:

@@ -84,7 +84,7 @@ def evaluate_run(run: RunFolder, pattern: str) -> dict[str, Any]:
     state = read_table(run.path / STATE)
     case = load_case(Path(run.read_config()["case"])).check()
     case = with_recordings(case, pattern)
-    model = case_model(case, refined=int(state["refined"]), before=BEFORE_ROWS)
+    model = case_model(case, refined=int(state["refined"]), before=BEFORE)
     windows = model.windows(range(len(model.recordings)))
     shots = model.shots(windows)
     places = [state["channels"].index(c) for c in model.channels if c in state["channels"]]
@@ -111,7 +111,8 @@ def evaluate_run(run: RunFolder, pattern: str) -> dict[str, Any]:
     return {"schema": 1, "fit": fit}
 
 
-BEFORE_ROWS = 25
+BEFORE = 1.0
+"""s of commands before a window, which actuators may not have forgotten."""
 
 
 def with_recordings(case: LoadedCase, pattern: str) -> LoadedCase:

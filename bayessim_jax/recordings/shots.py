@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -54,8 +55,8 @@ class CaseModel:
     channels: tuple[str, ...]
     """Measured channels, in the order of the predictions."""
     remarks: tuple[str, ...] = ()
-    before: int = 0
-    """Rows of commands before a window that are kept."""
+    before: float = 0.0
+    """s of commands before a window that are kept."""
     refined: int = 1
     """Time steps of the simulation in one of the model's own."""
 
@@ -95,12 +96,13 @@ class CaseModel:
 
     def inputs(self, windows: Windows) -> Inputs:
         """Initial states and commands."""
-        past = np.zeros((len(windows), self.before, windows.ctrl.shape[-1]))
+        before = math.ceil(self.before / self.system.dt - 1e-9)
+        past = np.zeros((len(windows), before, windows.ctrl.shape[-1]))
         for w in range(len(windows)):
             recording = self.recordings[windows.recording[w]]
             row = int(np.argmin(np.abs(recording.time - windows.start[w])))
-            if self.before:
-                rows = np.maximum(np.arange(row - self.before, row), 0)
+            if before:
+                rows = np.maximum(np.arange(row - before, row), 0)
                 past[w] = recording.ctrl[rows]
         place = windows.sensors[:, 0] if isinstance(self.system, Restarted) else windows.qpos[:, 0]
         return Inputs(*map(jnp.asarray, (place, windows.qvel[:, 0], windows.ctrl, past, windows.start)))
@@ -138,7 +140,7 @@ def _rows(windows: Windows) -> Bool[np.ndarray, "windows rows"]:
     return np.concatenate([first, windows.valid], axis=1)
 
 
-def case_model(case: LoadedCase, *, engine: str = "auto", before: int = 0, refined: int = 1) -> CaseModel:
+def case_model(case: LoadedCase, *, engine: str = "auto", before: float = 0.0, refined: int = 1) -> CaseModel:
     """Make a case's system, on a time step that its recordings' rows are a whole number of steps apart.
 
     With `refined` the simulation takes so many steps for one of the model's. Recordings whose rows are not evenly

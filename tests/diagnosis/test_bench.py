@@ -32,7 +32,7 @@ def problem(tmp_path_factory):
     jax.config.update("jax_enable_x64", True)
     folder = tmp_path_factory.mktemp("bench") / "rig"
     make_case(folder, "pendulum", "coulomb_friction", seed=3, recordings=2, seconds=2.0)
-    model = case_model(load_case(folder).check(), before=10)
+    model = case_model(load_case(folder).check(), before=0.04)
     windows = model.windows([0, 1])
     inputs = model.inputs(windows)
     scales = {place: Scales(timestep=0.002, period=0.004) for _, place in PAIRS}

@@ -22,7 +22,7 @@ def rig(tmp_path_factory):
     jax.config.update("jax_enable_x64", True)
     folder = tmp_path_factory.mktemp("experiment") / "rig"
     make_case(folder, "pendulum", seed=3, recordings=1, seconds=2.0)
-    model = case_model(load_case(folder).check(), before=10)
+    model = case_model(load_case(folder).check(), before=0.04)
     pairs = [(EFFECTS["coulomb_friction"], "joint/hinge"), (EFFECTS["viscous_friction"], "joint/hinge")]
     scales = {"joint/hinge": Scales(timestep=0.002, period=DT)}
     shots = model.shots(model.windows([0]))

@@ -106,16 +106,20 @@ def test_friction_along_a_motion_opposes_it_and_grows_with_its_level():
     np.testing.assert_allclose((beside - force)[0] / 1e-5, slopes[0, :, 0], rtol=1e-3, atol=1e-6)
 
 
-def test_a_lag_along_the_commands_is_the_difference_of_two_equations():
-    commands = jnp.ones((1, 60, 1)).at[:, :20].set(0.0)
-    time, joint = along(jnp.zeros((1, 60)))
+@pytest.mark.parametrize("long_ago", [0.0, 2.0])
+def test_a_lag_along_the_commands_is_the_difference_of_two_equations(long_ago):
+    commands, older = jnp.ones((1, 60, 1)).at[:, :20].set(0.0), jnp.full((1, 7, 1), long_ago)
+    time, joint = along(jnp.zeros((1, 40)))
     kinds = (("time_constant", "uniform"),)
     low, high, x = jnp.array([0.0]), jnp.array([0.08]), jnp.zeros(1)
     effect = EFFECTS["actuator_lag"]
-    changes, _ = commands_of(effect, kinds, 0.002, 2, 20, x, low, high, time, joint, commands, jnp.asarray(1.0))
+    changes, _ = commands_of(
+        effect, kinds, 0.002, 2, 20, 0.01, x, low, high, time, joint, commands, older, jnp.array([3.0])
+    )
     assert changes.shape == (1, 20, 1)
     after = 0.002 * (np.arange(40).reshape(20, 2).mean(1) + 0.5)
-    np.testing.assert_allclose(changes[0, :, 0], -np.exp(-after / 0.04), atol=2e-3)
+    held = long_ago * np.exp(-1.0) - 1.0
+    np.testing.assert_allclose(changes[0, :, 0], 3.0 * held * np.exp(-after / 0.04), atol=5e-3)
 
 
 def test_a_scaled_sensor_is_undone_with_its_derivatives():

@@ -242,6 +242,23 @@ def test_windows_restarted_with_past_commands_go_on_as_the_whole():
     np.testing.assert_allclose(later.base.physics.qpos[0], states.base.physics.qpos[0][40:], atol=1e-5)
 
 
+def test_a_long_past_is_gone_through_in_few_steps():
+    """A limit that is always behind, and a delay before it: the beginning counts for as long as it lasts."""
+    base = system(*MODELS["pendulum"])
+    pairs = [("actuator_delay", "actuator/m"), ("actuator_rate_limit", "actuator/m")]
+    augmented = with_effects(base, [(EFFECTS[n], p) for n, p in pairs], Scales(duration=8.0))
+    theta = jnp.array([0.5, 0.05, 0.4])
+    actions = jnp.asarray(0.4 * np.sign(np.sin(2.1 * 0.01 * np.arange(700)))[:, None], float)
+    state = augmented.begin(theta, jnp.array([0.3]), jnp.zeros(1), actions[0])
+    states = augmented.replay(theta, state, actions)
+    middle = jax.tree.map(lambda x: x[599], states)
+    where = (augmented.positions(middle), augmented.velocities(middle), actions[600])
+    wanted = float(middle.memories[1])
+    whole, short = (augmented.begin(theta, *where, time=6.0, past=actions[600 - k : 600]) for k in (600, 20))
+    assert abs(float(whole.memories[1]) - wanted) < 0.06
+    assert abs(float(short.memories[1]) - wanted) > 0.15
+
+
 def test_what_a_system_lacks_is_told():
     base = system(*MODELS["pendulum"])
     with pytest.raises(ValueError, match="no hinge or slide 'knee'"):
