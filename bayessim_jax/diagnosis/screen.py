@@ -37,8 +37,8 @@ GLANCING = 6
 """Steps of the solver from each of two points, by which partners of a known effect are ranked."""
 STRAYED = 1.5
 """Of θ's z: where the simulator without an effect was driven further out, a candidate also begins from the middle."""
-DRAWS = 4
-"""Points of its prior from which a candidate of several parameters is begun beside the usual ones."""
+DRAWS, ASIDE = 4, 0.7
+"""Points of its prior from which a candidate of several parameters is begun beside the usual ones, and of one."""
 EDGE = 0.02
 """Share of a prior at either end where nothing begins."""
 
@@ -97,6 +97,8 @@ class Screen:
             for k, z in chain(*chosen):
                 point[k] = z
             points.append(point)
+        if len(each) == 1 and not grids:
+            points += [np.array([-ASIDE]), np.array([ASIDE])]
         if len(each) > 1:
             points += [random.standard_normal(len(each)) for _ in range(DRAWS)]
         return points

@@ -25,7 +25,7 @@ class SensorScale(SenseEffect):
 
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The scale k."""
-        return (EffectParameter("scale", "", 0.5, 2.0, 1.0, 1.05),)
+        return (EffectParameter("scale", "", 0.5, 2.0, 1.0, 1.05, scan=5),)
 
     def sense(self, values: Values, memory: Memory, reading: Scalar, moment: Moment) -> Scalar:
         """The product k q."""
