@@ -219,9 +219,11 @@ def _finalists(screen: Screen, nothing: Screened, ranked: Sequence[Screened]) ->
 
 
 def _pair(screen: Screen, ranked: Sequence[Screened], random: np.random.Generator) -> list[Screened]:
-    """Pairs of the best single effects with every other one, the best first."""
-    found, seen = [], set()
-    for known in ranked[:LEADERS]:
+    """Pairs of the best single effects with every other one, then of the best pair's members, the best first."""
+    found: list[Screened] = []
+    seen: set[Candidate] = set()
+
+    def extend(known: Screened) -> None:
         first = []
         for k in range(len(screen.pairs)):
             pair = known.candidate + Candidate((k,))
@@ -235,7 +237,15 @@ def _pair(screen: Screen, ranked: Sequence[Screened], random: np.random.Generato
         for _, pair in first[:GLANCED]:
             begun = screen.begin_candidate(pair, known, random)
             ended = screen.finish_candidate(begun, known) if begun is not None else None
-            found += [ended] if ended is not None else []
+            found.extend([ended] if ended is not None else [])
+
+    for known in ranked[:LEADERS]:
+        extend(known)
+    led = {known.candidate.effects[0] for known in ranked[:LEADERS]}
+    best = max(found, key=lambda item: item.score, default=None)
+    for k in best.candidate.effects if best else ():
+        if best and k not in led:
+            extend(screen.part(best, k))
     return sorted(found, key=lambda item: -item.score)
 
 

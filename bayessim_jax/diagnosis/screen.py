@@ -8,7 +8,7 @@ hundredths of a second, so that pairs are tried as well. What comes out on top i
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, product
 from typing import Any
 
@@ -200,6 +200,14 @@ class Screen:
             return None
         best = min(ends, key=lambda end: float(end[2].cost))
         return self.settle(begun.candidate, best[0], best[1], known.sigma)
+
+    def part(self, found: Screened, effect: int) -> Screened:
+        """One effect of a candidate by itself, with the numbers that it has there."""
+        p = np.zeros(self.d + self.slots)
+        p[: self.d] = found.p[: self.d]
+        place = dict(self.offsets(found.candidate))[effect]
+        p[self.d : self.d + place.stop - place.start] = found.p[place]
+        return replace(found, candidate=Candidate((effect,)), p=jnp.asarray(p))
 
     def misfit(self, key: PRNGKeyArray, found: Screened) -> Misfit:
         """What a candidate leaves of the misfit."""

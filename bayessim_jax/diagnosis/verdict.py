@@ -36,7 +36,7 @@ class Thresholds:
 
     negligible: float = 0.02
     """Power of a misfit over that of the noise, below which it is none."""
-    left: float = 0.05
+    left: float = 0.03
     """Share of the baseline's misfit that an explanation may leave."""
     enough: float = 0.015
     """Share that a single effect may leave before pairs are tried."""
