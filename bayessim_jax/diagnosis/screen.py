@@ -83,8 +83,9 @@ class Screen:
         each = [(p, m) for k in candidate.effects for p, m in zip(parameters[k], margin[k], strict=True)]
         begin = np.array([float(m.standard(jnp.asarray(p.start, float))) for p, m in each])
         points = [begin]
-        if any(p.low < 0.0 for p, _ in each):
-            points.append(-begin)
+        signs = np.array([-1.0 if p.low < 0.0 else 1.0 for p, _ in each])
+        if (signs < 0.0).any():
+            points.append(signs * begin)
         grids = []
         for unit in dict.fromkeys(p.unit for p, _ in each if p.scan):
             together = [k for k, (p, _) in enumerate(each) if p.scan and p.unit == unit]

@@ -117,6 +117,19 @@ def test_the_concealed_effect_comes_out_first_along_the_motion(problem):
     assert float(level) == pytest.approx(simulated, rel=0.05)
 
 
+def test_fits_begin_all_over_parameters_with_many_maxima(problem):
+    names = ("torque_ripple", "disturbance_event", "viscous_friction")
+    screen = problem.screen([(EFFECTS[name], "joint/hinge") for name in names])
+    ripple, event, viscous = (
+        np.array(screen.starts(Candidate((k,)), np.random.default_rng(0))) for k in range(len(names))
+    )
+    parameters = {p.name: k for k, p in enumerate(screen.scene.parameters[0])}
+    assert len(np.unique(ripple[:, parameters["cycles"]].round(9))) >= 20
+    begin, end = (screen.scene.margin[1][k].value(event[:10, k]) for k in (0, 1))
+    assert (begin < end).all() and np.ptp(begin) > 0.6 * problem.scales["joint/hinge"].duration
+    assert viscous.shape == (3, 1)
+
+
 @pytest.mark.parametrize("group", [[0] * 9, [0, 0, 0, 1, 1, 2, 2, 3, 4]])
 def test_every_window_is_scored_by_a_fit_to_others(group):
     group = np.array(group)
