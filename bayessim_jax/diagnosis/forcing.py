@@ -44,7 +44,9 @@ def _values(kinds: Kinds, x: Array, low: Array, high: Array) -> dict[str, Array]
     return {name: Margin(kind, 0.0, 1.0).between(low[k], high[k]).value(x[k]) for k, (name, kind) in enumerate(kinds)}
 
 
-@partial(jax.jit, static_argnames=("effect", "kinds", "detail", "h", "steps"), compiler_options=COMPILER_OPTIONS)
+@partial(
+    jax.jit, static_argnames=("effect", "kinds", "detail", "h", "steps", "period"), compiler_options=COMPILER_OPTIONS
+)
 def force_of(
     effect: Any,
     kinds: Kinds,
@@ -57,13 +59,18 @@ def force_of(
     time: Float[Array, "windows steps"],
     joint: Joint,
     other: Joint | None,
+    earlier: tuple[Float[Array, "windows before"], Float[Array, "windows before"]] | None = None,
+    period: float = 0.0,
 ) -> tuple[Float[Array, "windows rows"], Float[Array, "windows rows k"]]:
-    """Mean force of a `ForceEffect` in every row of so many time steps, and its derivatives along x."""
+    """Mean force of a `ForceEffect` in every row of so many time steps, and its derivatives along x.
+
+    `earlier` are positions and velocities before the windows, every `period` s, for one that remembers them.
+    """
 
     def force(x: Array) -> Array:
         values = _values(kinds, x, low, high)
 
-        def window(time: Array, joint: Joint, other: Joint | None) -> Array:
+        def window(time: Array, joint: Joint, other: Joint | None, earlier: Any) -> Array:
             def moment(time: Array, joint: Joint, other: Joint | None) -> Moment:
                 beside = None if other is None else other.moment(time, h)
                 return joint.moment(time, h)._replace(detail=detail, other=beside)
@@ -75,9 +82,11 @@ def force_of(
             rows = (time, joint, other)
             first = jax.tree.map(lambda a: a[0], rows)
             begun = jax.tree.map(lambda m: jnp.asarray(m, time.dtype), effect.begin(values, moment(*first)))
+            if earlier is not None:
+                begun = effect.recall(values, begun, *earlier, period)
             return jax.lax.scan(once, begun, rows)[1].reshape(-1, steps).mean(-1)
 
-        return jax.vmap(window)(time, joint, other)
+        return jax.vmap(window)(time, joint, other, earlier)
 
     return _with_slopes(force, x)
 

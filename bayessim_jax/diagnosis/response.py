@@ -48,6 +48,8 @@ class Motion:
     past: Float[Array, "windows before nu"]
     start: Float[Array, " windows"]
     """s in its recording."""
+    earlier: tuple[Float[Array, "windows before nq"], Float[Array, "windows before nv"]] | None = None
+    """Positions and velocities before the windows, in as many rows as `past`."""
 
 
 @struct.dataclass

@@ -232,7 +232,13 @@ class Scene:
         kinds, x, (low, high) = self.kinds[e], p[place], self.ranges[e]
         if effect.port == "force":
             other = self._joint(site.other, around, ()) if site.other >= 0 else None
-            f, along = force_of(effect, kinds, site.detail, self.h, self.fine, x, low, high, self.times, joint, other)
+            seen, earlier = (self.h, self.fine, x, low, high, self.times, joint, other), self.motion.earlier
+            if effect.recalls and earlier is not None and earlier[0].shape[1]:
+                places = int(self.model.jnt_qposadr[site.joint]), self._dof(site.joint)
+                moved = tuple(rows[..., k] for rows, k in zip(earlier, places, strict=True))
+                f, along = force_of(effect, kinds, site.detail, *seen, moved, self.system.dt)
+            else:
+                f, along = force_of(effect, kinds, site.detail, *seen)
             return [(self._dof(site.joint), f, along, place.start)]
         gains = self._gains(site.actuators, around)
         commands, older, coarse, before = self._commands(site.actuators, effect.looks)

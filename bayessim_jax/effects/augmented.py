@@ -111,11 +111,13 @@ class AugmentedMjcf:
         action: Float[Array, " act"] | None = None,
         time: Scalar | float = 0.0,
         past: Actions | None = None,
+        motion: tuple[Float[Array, "periods nq"], Float[Array, "periods nv"]] | None = None,
     ) -> AugmentedState:
         """The state with these measured positions and velocities, `time` seconds into a recording.
 
         `action` is the command of the first control period, without it zero; `past` are those before it, one row for
-        each control period, the most recent last, without them as if the first had always been held.
+        each control period, the most recent last, without them as if the first had always been held. `motion` are
+        positions and velocities of as many control periods, for effects that remember how a joint has moved.
         """
         kind = jnp.result_type(theta)
         numbers, inner = self._prepare(theta)
@@ -139,7 +141,8 @@ class AugmentedMjcf:
         if past is not None and len(past):
             state = self._warm(theta, numbers, state, jnp.asarray(past, kind))
         commands, _ = self._commands(theta, numbers, state, first)
-        return self._begin_joints(theta, numbers, inner, state, commands)
+        state = self._begin_joints(theta, numbers, inner, state, commands)
+        return state if motion is None or not len(motion[0]) else self._recall(theta, state, *motion)
 
     def restart(self, theta: Float[Array, " d"], observation: Float[Array, " obs"]) -> AugmentedState:
         """The state that shows this observation, as if nothing had been commanded for long.
@@ -367,6 +370,15 @@ class AugmentedMjcf:
         for k, w in self._at("force"):
             moment = self._joint_moment(numbers, state, w.site, commands, accelerations)
             memories[k] = _arrays(w.effect.begin(w.values(theta), moment), state.time)
+        return replace(state, memories=tuple(memories))
+
+    def _recall(self, theta: Float[Array, " d"], state: AugmentedState, qpos: Array, qvel: Array) -> AugmentedState:
+        """The memories of effects that remember how their joint has moved."""
+        memories = list(state.memories)
+        for k, w in self._at("force"):
+            if w.effect.recalls:
+                place, dof = int(self.engine.model.jnt_qposadr[w.site.joint]), self._dof(w.site.joint)
+                memories[k] = w.effect.recall(w.values(theta), memories[k], qpos[:, place], qvel[:, dof], self.dt)
         return replace(state, memories=tuple(memories))
 
     def _push(self, inner: Float[Array, " e"], physics: Any, ctrl: Float[Array, " act"]) -> Float[Array, " nv"]:

@@ -25,6 +25,7 @@ class Hysteresis(ForceEffect):
 
     name = "hysteresis"
     holds = True
+    recalls = True
 
     def places(self, model: mujoco.MjModel) -> list[str]:
         """Every hinge and slide."""

@@ -30,6 +30,8 @@ class Inputs:
     """Commands of the rows before the window, the last one just before it."""
     time: Float[Array, ""]
     """When the window begins, s in its recording."""
+    motion: tuple[Float[Array, "before nq"], Float[Array, "before nv"]] | None = None
+    """Positions and velocities in the rows before the window, at rest before the recording begins."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +83,7 @@ def replay_window(system: Any, theta: Array, delta: Float[Array, " n"], window: 
         state = dataclasses.replace(state, ctrl=window.ctrl[0]) if commanded else state
     else:
         past = window.past if commanded and window.past.shape[0] else None
-        state = system.begin(theta, qpos, qvel, window.ctrl[0] if commanded else None, window.time, past)
+        state = system.begin(theta, qpos, qvel, window.ctrl[0] if commanded else None, window.time, past, window.motion)
     first = system.observe(theta, state)
     after = jax.vmap(system.observe, in_axes=(None, 0))(theta, system.replay(theta, state, window.ctrl))
     return jnp.concatenate([first[None], after])

@@ -219,7 +219,9 @@ def _take_case(key: Array, model: CaseModel, effects: Sequence[Any], say: Callab
 def _motion(model: CaseModel, windows: Windows, smooth: Windows) -> Motion:
     """The smoothed motion in windows, with their commands."""
     inputs = model.inputs(windows)
-    return Motion(jnp.asarray(smooth.qpos), jnp.asarray(smooth.qvel), inputs.ctrl, inputs.past, inputs.time)
+    return Motion(
+        jnp.asarray(smooth.qpos), jnp.asarray(smooth.qvel), inputs.ctrl, inputs.past, inputs.time, inputs.motion
+    )
 
 
 def _smoothed(model: CaseModel) -> CaseModel:

@@ -97,15 +97,19 @@ class CaseModel:
     def inputs(self, windows: Windows) -> Inputs:
         """Initial states and commands."""
         before = math.ceil(self.before / self.system.dt - 1e-9)
-        past = np.zeros((len(windows), before, windows.ctrl.shape[-1]))
+        shapes = (windows.ctrl, windows.qpos, windows.qvel)
+        past, places, rates = (np.zeros((len(windows), before, x.shape[-1])) for x in shapes)
         for w in range(len(windows)):
             recording = self.recordings[windows.recording[w]]
             row = int(np.argmin(np.abs(recording.time - windows.start[w])))
             if before:
-                rows = np.maximum(np.arange(row - before, row), 0)
-                past[w] = recording.ctrl[rows]
+                rows = np.arange(row - before, row)
+                begun, rows = rows >= 0, np.maximum(rows, 0)
+                past[w], places[w] = recording.ctrl[rows], recording.qpos[rows]
+                rates[w] = np.where(begun[:, None], recording.qvel[rows], 0.0)
         place = windows.sensors[:, 0] if isinstance(self.system, Restarted) else windows.qpos[:, 0]
-        return Inputs(*map(jnp.asarray, (place, windows.qvel[:, 0], windows.ctrl, past, windows.start)))
+        first = (place, windows.qvel[:, 0], windows.ctrl, past, windows.start)
+        return Inputs(*map(jnp.asarray, first), motion=(jnp.asarray(places), jnp.asarray(rates)))
 
     def _stack(self, qpos: np.ndarray, qvel: np.ndarray, sensors: np.ndarray) -> np.ndarray:
         layout = self.case.layout

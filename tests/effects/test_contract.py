@@ -259,6 +259,20 @@ def test_a_long_past_is_gone_through_in_few_steps():
     assert abs(float(short.memories[1]) - wanted) > 0.15
 
 
+def test_a_bent_joint_remembers_how_it_has_moved():
+    base = system(*MODELS["pendulum"])
+    augmented = with_effects(base, [(EFFECTS["hysteresis"], "joint/hinge")], Scales(position=10.0))
+    theta, actions = start_of(augmented), jnp.asarray(chirp(80, force=0.5), float)
+    states = augmented.replay(theta, augmented.begin(theta, jnp.array([0.3]), jnp.zeros(1), actions[0]), actions)
+    middle = jax.tree.map(lambda x: x[59], states)
+    motion = tuple(jax.vmap(read)(states)[:60] for read in (augmented.positions, augmented.velocities))
+    where = (augmented.positions(middle), augmented.velocities(middle), actions[60])
+    with_motion, without = (augmented.begin(theta, *where, time=0.6, motion=m) for m in (motion, None))
+    bent = float(middle.memories[0])
+    assert float(with_motion.memories[0]) == pytest.approx(bent, rel=0.05)
+    assert float(without.memories[0]) != pytest.approx(bent, rel=0.3)
+
+
 def test_what_a_system_lacks_is_told():
     base = system(*MODELS["pendulum"])
     with pytest.raises(ValueError, match="no hinge or slide 'knee'"):
