@@ -140,7 +140,9 @@ def decide(
     tied = [entry for entry in entries if _ties(entry, entries[0], thresholds)]
     # what more effects explain has to be worth them: another law of the same effect leaves a rest, too
     tied += [entry for entry in entries if entry not in tied and _suffices(entry, tied, none, thresholds)]
-    tied = [entry for entry in tied if _explains(entry, none, thresholds)]
+    tied = [
+        entry for entry in tied if _explains(entry, none, thresholds) and _is_worth(entry, entries, none, thresholds)
+    ]
     if not tied:
         return result
     fewest = min(len(entry.candidate.effects) for entry in tied)
@@ -167,6 +169,13 @@ def _suffices(entry: Entry, tied: Sequence[Entry], none: Entry, thresholds: Thre
         set(entry.names) < set(other.names) and share_left(other.misfit, none.misfit) > thresholds.worth * left
         for other in tied
     )
+
+
+def _is_worth(entry: Entry, entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:
+    """Whether what a set adds to a part of it leaves much less: a little less is what any further effect leaves."""
+    parts = [other for other in entries if set(other.names) < set(entry.names)]
+    left = share_left(entry.misfit, none.misfit)
+    return all(left <= thresholds.worth * share_left(part.misfit, none.misfit) for part in parts)
 
 
 def _ties(entry: Entry, best: Entry, thresholds: Thresholds) -> bool:

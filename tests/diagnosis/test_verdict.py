@@ -63,12 +63,13 @@ def test_a_special_case_stands_for_what_contains_it():
 
 
 def test_more_effects_have_to_be_worth_it():
-    single, small = entry(["a@x"], 100.0, 0.03), entry(["a@x", "b@y"], 120.0, 0.02)
+    single, small = entry(["a@x"], 100.0, 0.025), entry(["a@x", "b@y"], 120.0, 0.015)
     assert verdict(single, small).best.names == ["a@x"]
     assert verdict(single, entry(["a@x", "b@y"], 120.0, 0.002)).best.names == ["a@x", "b@y"]
     assert verdict(single, entry(["c@x", "b@y"], 120.0, 0.02)).best.names == ["c@x", "b@y"]
     assert verdict(entry(["a@x"], 100.0, 0.2), small).best.names == ["a@x", "b@y"]
-    assert verdict(single, entry(["a@x", "b@y"], 100.0, 0.03)).best.names == ["a@x"]
+    assert verdict(single, entry(["a@x", "b@y"], 100.0, 0.025)).best.names == ["a@x"]
+    assert verdict(entry(["a@x"], 100.0, 0.05), entry(["a@x", "b@y"], 120.0, 0.025)).verdict == "unexplained"
 
 
 def test_a_set_that_wins_in_few_recordings_is_less_probable():
