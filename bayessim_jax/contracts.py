@@ -231,14 +231,16 @@ class Estimator(Protocol[E]):
         state: E,
         thetas: Float[Array, "n d"],
         recordings: Recording,
+        observed: Recording,
         use: Bool[Array, " set"],
         box: Box,
         correct: bool = True,
     ) -> tuple[E, Any]:
         """Correct the posterior of sets on sets that were never trained on (leading axes of recordings: n, set).
 
-        `box` is the prior's support, to which posteriors are cut before they are judged. Without `correct` the
-        posterior is only judged. Info holds `coverage50`, `coverage90` and `overconfident`.
+        The correction is for sets like `observed`; `use` says which recordings count, in it and in the others. `box` is
+        the prior's support, to which posteriors are cut before they are judged. Without `correct` the posterior is only
+        judged. Info holds `coverage50`, `coverage90`, `overconfident` and `collapsed`.
         """
         ...
 

@@ -80,7 +80,7 @@ class Setup:
     """Rounds whose simulations are kept for the fit."""
     history: int = struct.field(pytree_node=False, default=32)
     """Recordings of the target that are remembered, the newest; the posterior is conditioned on all of them."""
-    calibrations: int = struct.field(pytree_node=False, default=128)
+    calibrations: int = struct.field(pytree_node=False, default=256)
     """Draws of θ for which as many recordings are simulated as the target has given, to calibrate their posterior."""
     components: int = struct.field(pytree_node=False, default=5)
     """Gaussians in the belief."""
@@ -182,7 +182,7 @@ class RoundInfo:
     uninformed: Bool[Array, ""]
     """The posterior of this round was wider than the belief and agreed with it, so the belief stayed."""
     collapsed: Bool[Array, ""]
-    """The belief fell to less than a thousandth of its volume in one round while the estimator was over-confident."""
+    """The belief is a posterior whose networks collapsed: `calibration.collapsed`."""
 
 
 class Keys(NamedTuple):
@@ -314,7 +314,14 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
     set_keys = jax.random.split(jax.random.fold_in(calibrate_key, 0), use.size)
     sets = jax.vmap(lambda k, p: simulate(k, setup, p, thetas[fresh:]), out_axes=1)(set_keys, policies)
     estimator, calibration = setup.estimator.calibrate(
-        calibrate_key, estimator, thetas[fresh:], sets, use, state.belief.box, correct=setup.proposal.accumulate
+        calibrate_key,
+        estimator,
+        thetas[fresh:],
+        sets,
+        history,
+        use,
+        state.belief.box,
+        correct=setup.proposal.accumulate,
     )
     q = setup.estimator.posterior(estimator, history, use)
     posterior = setup.proposal.combine(state.belief, proposal, q)
@@ -337,7 +344,7 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
         diverged=simulated.diverged.sum(),
         pool_size=weights.sum() ** 2 / (weights**2).sum(),
         uninformed=uninformed,
-        collapsed=(growth < -jnp.log(1e3)) & calibration.overconfident,
+        collapsed=calibration.collapsed & ~stays,
     )
     after = State(state.round + 1, belief, estimator, learner, pool, history, policies)
     return jax.lax.optimization_barrier((after, info))

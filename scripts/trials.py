@@ -66,6 +66,7 @@ def trials(
             "coverage50": infos.calibration.coverage50,
             "coverage90": infos.calibration.coverage90,
             "coverage90_network": infos.calibration.coverage90_network,
+            "collapsed": infos.collapsed,
             "diverged": infos.diverged,
         }
 
@@ -104,10 +105,11 @@ def gather(results: Iterable[dict[str, Any]], runs: int, name: str = "") -> list
 
 
 def _rounded(result: dict[str, Any]) -> dict[str, Any]:
-    """Arrays to four decimals, so that a run that is read again is the run that was made."""
+    """Arrays to four decimals, so that a run that is read again is the run that was made; none that are all NaN."""
     return {
         name: np.round(value.astype(float), 4) if isinstance(value, np.ndarray) else value
         for name, value in result.items()
+        if not (isinstance(value, np.ndarray) and np.isnan(value.astype(float)).all())
     }
 
 

@@ -127,7 +127,7 @@ class Settings:
     """Rounds whose simulations are kept for the fit."""
     history: int = 32
     """Recordings of the target that are remembered; the posterior is conditioned on all of them."""
-    calibrations: int = 128
+    calibrations: int = 256
     """Sets of recordings simulated in a round to calibrate the posterior of the set."""
     components: int = 5
     """Gaussians in the posterior."""

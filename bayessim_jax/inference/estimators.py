@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from scipy.special import chdtr, chdtri
 
 from bayessim_jax.beliefs import GaussianMixture
 from bayessim_jax.contracts import Box, Recording, Scalar
 from bayessim_jax.inference.encoders import Encoder, Features, lookup_encoder, transition_features
-from bayessim_jax.inference.evidence import Recalibration, combine_evidence, credible_level, recalibrate
+from bayessim_jax.inference.evidence import Recalibration, combine_evidence, credible_levels, nearness, recalibrate
 from bayessim_jax.inference.fit import FitInfo, Schedule, fit
 from bayessim_jax.inference.heads import MixtureHead
 from bayessim_jax.inference.summaries import FourierSummary, Summary
@@ -57,6 +58,9 @@ class CalibrationInfo:
     """Factor on the posterior's standard deviations (geometric mean over axes) that recalibration asked for."""
     overconfident: Bool[Array, ""]
     """The recalibrated 90 % sets hold so few truths that chance does not explain it (five standard errors)."""
+    collapsed: Bool[Array, ""]
+    """The networks' 90 % sets hold fewer truths than those of a Gaussian with half the standard deviations it should
+    have, by more than chance (three standard errors): most of the evidence that they see is not there."""
 
 
 @struct.dataclass
@@ -152,31 +156,33 @@ class MixtureDensity:
         state: EstimatorState,
         thetas: Float[Array, "n d"],
         recordings: Recording,
+        observed: Recording,
         use: Bool[Array, " set"],
         box: Box,
         correct: bool = True,
     ) -> tuple[EstimatorState, CalibrationInfo]:
-        """Measure the posterior of sets on sets that no network has seen, and take out what is wrong with it."""
+        """Measure the posterior of sets on sets that no network has seen, and take out what is wrong with it.
+
+        The half of them whose posteriors sit nearest that of the set observed counts, the nearest most.
+        """
         z = (thetas - state.shift) / state.scale
         x, valid = self._inputs(state, recordings)
         sound = use & ~recordings.diverged
         plain = jax.lax.map(
             lambda one: self._combined(state.params, one[0], one[1] & one[2][:, None], one[2]), (x, valid, sound)
         )
+        weights = nearness(plain, self._plain(state, observed, use))
         low, high = ((bound - state.shift) / state.scale for bound in (box.low, box.high))
-        before = credible_level(key, plain, z, low, high)
+        before = credible_levels(key, plain, z, low, high, jnp.ones(1))[:, 0]
         if not correct:
-            return state, _judge(before, before, jnp.ones(()))
-        recalibration, after = recalibrate(key, plain, z, low, high)
-        widen = jnp.exp(jnp.log(jnp.diagonal(recalibration.stretch)).mean()) * recalibration.inflation
-        return replace(state, recalibration=recalibration), _judge(before, after, widen)
+            return state, _judge(before, before, weights, z.shape[1], jnp.ones(()))
+        recalibration, after = recalibrate(key, plain, z, weights, low, high)
+        widen = jnp.exp(jnp.log(jnp.diagonal(recalibration.stretch)).mean())
+        return replace(state, recalibration=recalibration), _judge(before, after, weights, z.shape[1], widen)
 
     def posterior(self, state: EstimatorState, recordings: Recording, use: Bool[Array, " set"]) -> GaussianMixture:
         """The mixture q(θ | recordings in use), for one set, in the units of θ."""
-        x, valid = self._inputs(state, jax.tree.map(lambda leaf: leaf[None], recordings))
-        use = use & ~recordings.diverged
-        plain = self._combined(state.params, x[0], valid[0] & use[:, None], use)
-        return state.recalibration.apply(plain).affine(state.shift, state.scale)
+        return state.recalibration.apply(self._plain(state, recordings, use)).affine(state.shift, state.scale)
 
     def _log_prob(self, params: Any, inputs: Any, z: Float[Array, "n d"]) -> Float[Array, " n"]:
         return self.head.log_prob(params["head"], self.encoder.apply(params["encoder"], *inputs), z)
@@ -185,6 +191,12 @@ class MixtureDensity:
         x = jax.vmap(jax.vmap(self.features))(recordings)
         x = jnp.clip((x - state.feature_mean) / state.feature_scale, -10.0, 10.0)
         return jnp.where(recordings.valid[..., None], x, 0.0), recordings.valid
+
+    def _plain(self, state: EstimatorState, recordings: Recording, use: Bool[Array, " set"]) -> GaussianMixture:
+        """The networks' posterior of one set, in standardized θ."""
+        x, valid = self._inputs(state, jax.tree.map(lambda leaf: leaf[None], recordings))
+        use = use & ~recordings.diverged
+        return self._combined(state.params, x[0], valid[0] & use[:, None], use)
 
     def _combined(
         self, params: Any, x: Float[Array, "set steps features"], valid: Array, use: Bool[Array, " set"]
@@ -228,15 +240,20 @@ class MixtureDensity:
         )
 
 
-def _judge(before: Float[Array, " n"], after: Float[Array, " n"], widen: Scalar) -> CalibrationInfo:
-    """What the credible levels of n truths say, before and after recalibration."""
-    coverage90 = (after <= 0.9).mean()
+def _judge(
+    before: Float[Array, " n"], after: Float[Array, " n"], weights: Float[Array, " n"], d: int, widen: Scalar
+) -> CalibrationInfo:
+    """What the credible levels of n truths say, before and after recalibration; Σ w = (Σ w)² / Σ w²."""
+    share, count = weights / weights.sum(), weights.sum()
+    network, coverage90 = share @ (before <= 0.9), share @ (after <= 0.9)
+    halved = chdtr(d, chdtri(d, 0.1) / 4)  # P(χ² ≤ a/4) where P(χ² ≤ a) = 0.9
     return CalibrationInfo(
-        coverage90_network=(before <= 0.9).mean(),
-        coverage50=(after <= 0.5).mean(),
+        coverage90_network=network,
+        coverage50=share @ (after <= 0.5),
         coverage90=coverage90,
         widen=widen,
-        overconfident=coverage90 < 0.9 - 5.0 * jnp.sqrt(0.09 / after.size),
+        overconfident=coverage90 < 0.9 - 5.0 * jnp.sqrt(0.09 / count),
+        collapsed=network < halved - 3.0 * jnp.sqrt(halved * (1.0 - halved) / count),
     )
 
 

@@ -12,10 +12,21 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from bayessim_jax.beliefs import GaussianMixture, moment_match
 from bayessim_jax.contracts import Scalar
 
-__all__ = ["INFLATIONS", "Recalibration", "combine_evidence", "credible_level", "inflate", "recalibrate", "regress"]
+__all__ = [
+    "LEVELS",
+    "SCALES",
+    "Recalibration",
+    "combine_evidence",
+    "credible_levels",
+    "nearness",
+    "recalibrate",
+    "regress",
+]
 
-INFLATIONS = (1.0, 1.1, 1.2, 1.35, 1.5, 1.75, 2.0, 2.5)
-"""By how much a recalibrated posterior may be widened at the end."""
+SCALES = tuple(2.5 ** (k / 12) for k in range(-12, 13))
+"""Factors on the standard deviations of a recalibrated posterior among which its coverage chooses."""
+LEVELS = tuple(k / 20 for k in range(1, 20))
+"""Credible levels at which coverage is looked at."""
 
 
 def combine_evidence(each: GaussianMixture, use: Bool[Array, " set"]) -> GaussianMixture:
@@ -46,7 +57,7 @@ def combine_evidence(each: GaussianMixture, use: Bool[Array, " set"]) -> Gaussia
 
 @struct.dataclass
 class Recalibration:
-    """A correction of a posterior in the coordinates that its own moments whiten: a shift, a stretch, an inflation.
+    """A correction of a posterior in the coordinates that its own moments whiten: a shift and a stretch.
 
     The shift is linear in where the posterior sits, shift = (1, x) · slopes with x = (mean − origin)/unit, |x| ≤ 3.
     """
@@ -56,39 +67,44 @@ class Recalibration:
     slopes: Float[Array, "1+d d"]
     stretch: Float[Array, "d d"]
     """Lower triangular."""
-    inflation: Scalar
-    """Standard deviations after over before the last step, which adds to the covariance of every component."""
 
     @classmethod
     def none(cls, d: int) -> Recalibration:
         """The identity."""
-        return cls(jnp.zeros(d), jnp.ones(d), jnp.zeros((1 + d, d)), jnp.eye(d), jnp.ones(()))
+        return cls(jnp.zeros(d), jnp.ones(d), jnp.zeros((1 + d, d)), jnp.eye(d))
 
     def shift(self, mean: Float[Array, " d"]) -> Float[Array, " d"]:
         """By how many of its own standard deviations a posterior with this mean is off."""
         return self._features(mean) @ self.slopes
 
     def apply(self, mixture: GaussianMixture) -> GaussianMixture:
-        """θ ↦ μ + L (shift + stretch L⁻¹ (θ − μ)), then each Σₖ + (inflation² − 1) S, S the covariance so far."""
+        """θ ↦ μ + L (shift + stretch L⁻¹ (θ − μ))."""
         mean, tril = moment_match(mixture)
         inverse = jax.scipy.linalg.solve_triangular(tril, jnp.eye(mean.size), lower=True)
         linear = tril @ self.stretch @ inverse
-        moved = GaussianMixture(
+        return GaussianMixture(
             mixture.log_weights,
             mean + tril @ self.shift(mean) + (mixture.means - mean) @ linear.T,
             linear @ mixture.scale_trils,
         )
-        return inflate(moved, self.inflation)
 
     def _features(self, mean: Float[Array, " d"]) -> Float[Array, " 1+d"]:
         return jnp.concatenate([jnp.ones(1), jnp.clip((mean - self.origin) / self.unit, -3.0, 3.0)])
 
 
-def inflate(mixture: GaussianMixture, factor: Scalar) -> GaussianMixture:
-    """Each Σₖ + (factor² − 1) S with S the covariance of the mixture: the whole is wider, its details blurred."""
-    _, tril = moment_match(mixture)
-    parts = mixture.scale_trils @ jnp.swapaxes(mixture.scale_trils, -1, -2)
-    return replace(mixture, scale_trils=jnp.linalg.cholesky(parts + (factor**2 - 1.0) * (tril @ tril.T)))
+def nearness(mixtures: GaussianMixture, observed: GaussianMixture, share: float = 0.5) -> Float[Array, " n"]:
+    """Weights of simulated posteriors by how near their means lie to that of what was observed, Σ w = (Σ w)² / Σ w².
+
+    Epanechnikov's kernel max(0, 1 − ‖μᵢ − μ‖²/h²), with h the distance within which a `share` of them lie. Networks are
+    worse far from where most simulations are; what they get wrong there says nothing about the posterior at hand.
+
+    Source: Rodrigues et al. 2018
+    """
+    gaps = ((jax.vmap(GaussianMixture.mean)(mixtures) - observed.mean()) ** 2).sum(-1)
+    reach = jnp.sort(gaps)[int(share * (gaps.size - 1))]
+    weights = jnp.maximum(1.0 - gaps / jnp.maximum(reach, 1e-12), 0.0)
+    weights = jnp.where(weights.sum() > 0, weights, 1.0)
+    return weights * weights.sum() / (weights**2).sum()
 
 
 def regress(
@@ -99,8 +115,7 @@ def regress(
     r = L⁻¹ (θ − μ) of a calibrated posterior has mean zero and covariance I wherever μ is. The shift is the regression
     of r on μ, with bounded residuals and shrunk by `pseudo` observations: it takes out what the networks get wrong as
     a function of θ. The stretch is the root of the covariance of what is left, shrunk towards isotropy, with the
-    error of the regression added. It never narrows on the whole: a mixture with a sharp core and wide tails has small
-    residuals without being too wide.
+    error of the regression added. Where this says nothing sound, nothing is corrected.
 
     Source: Blum and François 2010
     """
@@ -133,7 +148,6 @@ def regress(
     shape = (n * covariance + 10.0 * jnp.trace(covariance) / d * jnp.eye(d)) / (n + 10.0)
     tril = jnp.linalg.cholesky(shape + 1e-6 * jnp.eye(d))
     stretch = jnp.sqrt((n + freedom) / (n - freedom)) * tril
-    stretch = stretch / jnp.minimum(1.0, jnp.exp(jnp.log(jnp.diagonal(stretch)).mean()))
     found = replace(where, slopes=slopes, stretch=stretch)
     sound = jnp.isfinite(slopes).all() & jnp.isfinite(stretch).all()
     return jax.tree.map(lambda a, b: jnp.where(sound, a, b), found, plain)
@@ -143,48 +157,57 @@ def recalibrate(
     key: PRNGKeyArray,
     mixtures: GaussianMixture,
     truths: Float[Array, "n d"],
+    weights: Float[Array, " n"],
     low: Float[Array, " d"],
     high: Float[Array, " d"],
 ) -> tuple[Recalibration, Float[Array, " n"]]:
     """The correction that makes held-out truths look like draws of their posteriors, and the levels that show it.
 
-    `regress` on all pairs, then the least inflation of `INFLATIONS` at which the 50 % and the 90 % sets, cut to the
-    box, hold at least their share of the truths. It is chosen, and the credible levels returned are taken, on each half
-    of the pairs with the regression on the other half.
+    `regress` on all pairs, and of `SCALES` the factor on its stretch at which the credible levels c of the truths, in
+    posteriors cut to the box, are nearest to uniform: the least Σₐ (P(c ≤ a) − a)² / (a (1 − a)) over `LEVELS`. Second
+    moments alone do not say that: a sharp core with wide tails, and what the box cuts off, change the mass of a set.
+    The factor is chosen, and the levels returned are taken, on each half of the pairs with the regression on the other.
+
+    Source: Anderson and Darling 1952
     """
-    n = truths.shape[0]
-    even = jnp.arange(n) % 2 == 0
-    parts = jnp.stack([jnp.ones(n), ~even, even]).astype(float)
+    even = jnp.arange(truths.shape[0]) % 2 == 0
+    parts = jnp.stack([weights, jnp.where(even, 0.0, weights), jnp.where(even, weights, 0.0)])
     found = jax.vmap(regress, (None, None, 0))(mixtures, truths, parts)
     whole = jax.tree.map(lambda leaf: leaf[0], found)
     other = jax.tree.map(lambda leaf: leaf[jnp.where(even, 1, 2)], found)
     crossed = jax.vmap(lambda correction, mixture: correction.apply(mixture))(other, mixtures)
-    factors = jnp.array(INFLATIONS)
-    levels = jax.lax.map(
-        lambda factor: credible_level(key, jax.vmap(inflate, (0, None))(crossed, factor), truths, low, high), factors
-    )
-    enough = ((levels <= 0.5).mean(-1) >= 0.5) & ((levels <= 0.9).mean(-1) >= 0.9)
-    least = jnp.where(enough.any(), jnp.argmax(enough), factors.size - 1)
-    return replace(whole, inflation=factors[least]), levels[least]
+    levels = credible_levels(key, crossed, truths, low, high, jnp.array(SCALES))
+    asked = jnp.array(LEVELS)
+    covered = jnp.einsum("n,nsa->sa", weights / weights.sum(), levels[..., None] <= asked)
+    best = jnp.argmin(((covered - asked) ** 2 / (asked * (1 - asked))).sum(-1))
+    return replace(whole, stretch=jnp.array(SCALES)[best] * whole.stretch), levels[:, best]
 
 
-def credible_level(
+def credible_levels(
     key: PRNGKeyArray,
     mixtures: GaussianMixture,
     truths: Float[Array, "n d"],
     low: Float[Array, " d"],
     high: Float[Array, " d"],
+    scales: Float[Array, " scales"],
     draws: int = 64,
-) -> Float[Array, " n"]:
+) -> Float[Array, "n scales"]:
     """Smallest highest-density credible level that holds the truth; uniform if calibrated.
 
-    The mixtures are cut to the box from `low` to `high`; the level is estimated from the draws that fall in it.
+    For each factor on the standard deviations of the whole mixture, its mean kept. The mixtures are cut to the box from
+    `low` to `high`; the level is estimated from the draws that fall in it, the same ones for every factor.
     """
 
-    def one(key: PRNGKeyArray, mixture: GaussianMixture, truth: Array) -> Scalar:
+    def one(key: PRNGKeyArray, mixture: GaussianMixture, truth: Array) -> Array:
         samples = jax.vmap(mixture.sample)(jax.random.split(key, draws))
-        inside = ((samples >= low) & (samples <= high)).all(-1)
-        denser = jax.vmap(mixture.log_prob)(samples) > mixture.log_prob(truth)
-        return (denser & inside).sum() / jnp.maximum(inside.sum(), 1)
+        densities, mean = jax.vmap(mixture.log_prob)(samples), mixture.mean()
+
+        def at(scale: Scalar) -> Scalar:
+            moved = mean + scale * (samples - mean)
+            inside = ((moved >= low) & (moved <= high)).all(-1)
+            denser = densities > mixture.log_prob(mean + (truth - mean) / scale)
+            return (denser & inside).sum() / jnp.maximum(inside.sum(), 1)
+
+        return jax.vmap(at)(scales)
 
     return jax.vmap(one)(jax.random.split(key, truths.shape[0]), mixtures, truths)

@@ -1,10 +1,15 @@
 import jax
 import jax.numpy as jnp
+import pytest
 
 from bayessim_jax.beliefs import GaussianMixture
-from bayessim_jax.inference.evidence import combine_evidence, credible_level, inflate, recalibrate, regress
+from bayessim_jax.inference.evidence import combine_evidence, credible_levels, nearness, recalibrate, regress
 
 FREE = -jnp.inf, jnp.inf
+
+
+def credible_level(key, mixtures, truths, low, high, draws=64):
+    return credible_levels(key, mixtures, truths, low, high, jnp.ones(1), draws)[:, 0]
 
 
 def _posteriors(key, theta, sd):
@@ -85,16 +90,9 @@ def test_a_pair_of_weight_zero_does_not_count():
     )
 
 
-def test_inflation_scales_the_covariance_of_the_whole():
-    tril = jnp.array([[[0.5, 0.0], [0.3, 0.2]], [[0.1, 0.0], [0.0, 0.9]]])
-    mixture = GaussianMixture(jnp.log(jnp.array([0.3, 0.7])), jnp.array([[0.0, 1.0], [2.0, -1.0]]), tril)
-    assert jnp.allclose(inflate(mixture, 1.5).covariance(), 2.25 * mixture.covariance(), rtol=1e-5)
-    assert jnp.allclose(inflate(mixture, 1.0).scale_trils, tril, atol=1e-6)
-
-
-def test_posteriors_that_leak_out_of_the_box_are_widened_until_their_sets_hold_enough():
+def test_a_posterior_that_leaks_out_of_the_box_is_recalibrated_to_the_sets_it_states():
     """Each states N(0.9 θ, σ²) on the whole line; cut to the box the stated sets are too small."""
-    n = 400
+    n = 800
     keys = jax.random.split(jax.random.key(9), 3)
     truths = jax.random.uniform(keys[0], (n, 1), minval=-1.0, maxval=1.0)
     means = truths + 0.8 * jax.random.normal(keys[1], (n, 1))
@@ -102,7 +100,47 @@ def test_posteriors_that_leak_out_of_the_box_are_widened_until_their_sets_hold_e
     box = -jnp.ones(1), jnp.ones(1)
     before = credible_level(keys[2], stated, truths, *box)
     assert (before <= 0.9).mean() < 0.82
-    found, level = recalibrate(keys[2], stated, truths, *box)
-    assert 0.5 <= (level <= 0.5).mean() < 0.6 and 0.9 <= (level <= 0.9).mean() < 0.96
+    found, level = recalibrate(keys[2], stated, truths, jnp.ones(n), *box)
+    assert _near(level, 0.5, 0.04) and _near(level, 0.9, 0.03)
     again = credible_level(jax.random.key(10), jax.vmap(found.apply)(stated), truths, *box, draws=512)
-    assert abs(float((again <= 0.9).mean()) - 0.92) < 0.03
+    assert _near(again, 0.5, 0.04) and _near(again, 0.9, 0.03)
+
+
+def _near(levels, asked, slack):
+    return abs(float((levels <= asked).mean()) - asked) < slack
+
+
+@pytest.mark.parametrize("factor", [0.6, 1.0, 1.6])
+def test_recalibration_is_as_ready_to_narrow_as_to_widen(factor):
+    """Over many small calibrations the sets of fresh posteriors hold their share: neither fewer truths nor more."""
+
+    def one(key):
+        keys = jax.random.split(key, 4)
+        n = 256
+        means = jax.random.normal(keys[0], (2 * n, 2))
+        truths = means + 0.3 * jax.random.normal(keys[1], (2 * n, 2))
+        trils = jnp.broadcast_to(0.3 * factor * jnp.eye(2), (2 * n, 1, 2, 2))
+        stated = GaussianMixture(jnp.zeros((2 * n, 1)), means[:, None], trils)
+        seen, fresh = (jax.tree.map(lambda leaf, part=part: leaf[part], stated) for part in (slice(n), slice(n, None)))
+        found, _ = recalibrate(keys[2], seen, truths[:n], jnp.ones(n), -jnp.full(2, 9.0), jnp.full(2, 9.0))
+        return credible_level(keys[3], jax.vmap(found.apply)(fresh), truths[n:], *FREE)
+
+    levels = jax.lax.map(one, jax.random.split(jax.random.key(11), 24)).ravel()
+    assert _near(levels, 0.5, 0.02) and _near(levels, 0.9, 0.015)
+
+
+def test_recalibration_looks_at_the_simulations_near_what_was_observed():
+    """Networks that are right in the middle and overstate what they know elsewhere stay as they are in the middle."""
+    n = 2000
+    keys = jax.random.split(jax.random.key(12), 3)
+    means = 1.5 * jax.random.normal(keys[0], (n, 2))
+    sd = 0.2 * jnp.where(jnp.linalg.norm(means, axis=-1) > 1.5, 4.0, 1.0)
+    truths = means + sd[:, None] * jax.random.normal(keys[1], (n, 2))
+    stated = GaussianMixture(jnp.zeros((n, 1)), means[:, None], jnp.broadcast_to(0.2 * jnp.eye(2), (n, 1, 2, 2)))
+    middle = GaussianMixture(jnp.zeros(1), jnp.zeros((1, 2)), 0.2 * jnp.eye(2)[None])
+    weights = nearness(stated, middle, share=0.3)
+    assert jnp.allclose(weights.sum(), weights.sum() ** 2 / (weights**2).sum(), rtol=1e-4)
+    near, _ = recalibrate(keys[2], stated, truths, weights, *FREE)
+    far, _ = recalibrate(keys[2], stated, truths, jnp.ones(n), *FREE)
+    assert jnp.allclose(jnp.diagonal(near.stretch), 1.0, atol=0.15)
+    assert (jnp.diagonal(far.stretch) > 1.5).all()

@@ -48,6 +48,7 @@ def made_up(rounds=16, seeds=1, d=2, known=True, **changes):
                 "log_q_train": 1.2 * r**0.5,
                 "log_q_validation": r**0.5,
                 "coverage90": 0.88 + 0.03 * rng.normal(),
+                "coverage90_network": 0.7,
                 "level_true": float(rng.uniform()),
                 "rank_true": named(rng.uniform(size=d)),
                 "mean": named(x[s].mean(0)),
