@@ -131,3 +131,8 @@ def load(path: Path, labels: dict[str, Any]) -> list[dict[str, Any]]:
         if all(row.get(name) == value for name, value in labels.items()):
             found.append({k: np.asarray(v) if isinstance(v, list) else v for k, v in row.items()})
     return found
+
+
+def kept(path: Path, runs: int, labels: dict[str, Any]) -> list[dict[str, Any]]:
+    """The first runs of a file that carry these labels, in their order; none is made."""
+    return sorted(load(path, labels), key=lambda result: result["run"])[:runs]

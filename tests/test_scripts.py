@@ -20,7 +20,7 @@ def test_rows_of_table_one_run_and_resume(tmp_path):
     words = ["--rows", "fetch_push", "--columns", "epsilon_free", "--runs", 1, "--rounds", 2, "--small"]
     said = run("reproduce_table1.py", *words, "--out", tmp_path / "t.jsonl")
     assert "fetch_push" in said
-    assert "paper 2.09" in said
+    assert "| 2.10 |" in said
     assert len((tmp_path / "t.jsonl").read_text().splitlines()) == 1
     assert run("reproduce_table1.py", *words, "--out", tmp_path / "t.jsonl").split("\r")[-1] == said.split("\r")[-1]
 
