@@ -9,18 +9,24 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
-from scipy.special import chdtr, chdtri
 
 from bayessim_jax.beliefs import GaussianMixture
-from bayessim_jax.contracts import Box, Recording, Scalar
+from bayessim_jax.contracts import Box, Recording
 from bayessim_jax.inference.encoders import Encoder, Features, lookup_encoder, transition_features
-from bayessim_jax.inference.evidence import Recalibration, combine_evidence, credible_levels, nearness, recalibrate
+from bayessim_jax.inference.evidence import combine_evidence
 from bayessim_jax.inference.fit import FitInfo, Schedule, fit
 from bayessim_jax.inference.heads import MixtureHead
+from bayessim_jax.inference.recalibration import (
+    CalibrationInfo,
+    Recalibration,
+    credible_levels,
+    judge,
+    nearness,
+    recalibrate,
+)
 from bayessim_jax.inference.summaries import FourierSummary, Summary
 
 __all__ = [
-    "CalibrationInfo",
     "EstimatorState",
     "MixtureDensity",
     "fourier_mixture",
@@ -42,25 +48,6 @@ class EstimatorState:
     recalibration: Recalibration
     fitted: Bool[Array, ""]
     """Whether the feature units are set; they are taken from the first fit and kept."""
-
-
-@struct.dataclass
-class CalibrationInfo:
-    """How the posterior of simulated sets did, before it was recalibrated and after."""
-
-    coverage90_network: Scalar
-    """Share of truths inside the 90 % credible set of the networks' posterior, before recalibration."""
-    coverage50: Scalar
-    """The same for 50 % sets after recalibration, each half of the sets corrected by a regression on the other half."""
-    coverage90: Scalar
-    """And for 90 % sets."""
-    widen: Scalar
-    """Factor on the posterior's standard deviations (geometric mean over axes) that recalibration asked for."""
-    overconfident: Bool[Array, ""]
-    """The recalibrated 90 % sets hold so few truths that chance does not explain it (five standard errors)."""
-    collapsed: Bool[Array, ""]
-    """The networks' 90 % sets hold fewer truths than those of a Gaussian with half the standard deviations it should
-    have, by more than chance (three standard errors): most of the evidence that they see is not there."""
 
 
 @struct.dataclass
@@ -175,10 +162,10 @@ class MixtureDensity:
         low, high = ((bound - state.shift) / state.scale for bound in (box.low, box.high))
         before = credible_levels(key, plain, z, low, high, jnp.ones(1))[:, 0]
         if not correct:
-            return state, _judge(before, before, weights, z.shape[1], jnp.ones(()))
+            return state, judge(before, before, weights, z.shape[1], jnp.ones(()))
         recalibration, after = recalibrate(key, plain, z, weights, low, high)
         widen = jnp.exp(jnp.log(jnp.diagonal(recalibration.stretch)).mean())
-        return replace(state, recalibration=recalibration), _judge(before, after, weights, z.shape[1], widen)
+        return replace(state, recalibration=recalibration), judge(before, after, weights, z.shape[1], widen)
 
     def posterior(self, state: EstimatorState, recordings: Recording, use: Bool[Array, " set"]) -> GaussianMixture:
         """The mixture q(θ | recordings in use), for one set, in the units of θ."""
@@ -238,23 +225,6 @@ class MixtureDensity:
             scale=spread,
             fitted=jnp.array(True),
         )
-
-
-def _judge(
-    before: Float[Array, " n"], after: Float[Array, " n"], weights: Float[Array, " n"], d: int, widen: Scalar
-) -> CalibrationInfo:
-    """What the credible levels of n truths say, before and after recalibration; Σ w = (Σ w)² / Σ w²."""
-    share, count = weights / weights.sum(), weights.sum()
-    network, coverage90 = share @ (before <= 0.9), share @ (after <= 0.9)
-    halved = chdtr(d, chdtri(d, 0.1) / 4)  # P(χ² ≤ a/4) where P(χ² ≤ a) = 0.9
-    return CalibrationInfo(
-        coverage90_network=network,
-        coverage50=share @ (after <= 0.5),
-        coverage90=coverage90,
-        widen=widen,
-        overconfident=coverage90 < 0.9 - 5.0 * jnp.sqrt(0.09 / count),
-        collapsed=network < halved - 3.0 * jnp.sqrt(halved * (1.0 - halved) / count),
-    )
 
 
 def recurrent_mixture(
