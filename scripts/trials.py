@@ -70,7 +70,7 @@ def trials(
             "diverged": infos.diverged,
         }
 
-    compiled = jax.jit(one)
+    compiled = jax.jit(one, compiler_options=online.COMPILER_OPTIONS)
 
     def make(index: int) -> dict[str, Any]:
         return jax.tree.map(np.asarray, compiled(jax.random.fold_in(jax.random.key(seed), index)))
