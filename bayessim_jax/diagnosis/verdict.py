@@ -44,6 +44,8 @@ class Thresholds:
     """Share of what fewer effects leave, below which more effects are worth it."""
     tie: float = 2.0
     """Standard errors within which two candidates predict held-out windows alike."""
+    blur: float = 0.005
+    """Share of what the best candidate gains by which others may be worse and tie, where it is not wholly right."""
     least: float = 4.0
     """Nats in all by which a candidate has to be worse to be out of the confusion set."""
 
@@ -137,7 +139,7 @@ def decide(
     result = Diagnosis("unexplained", bench, none, entries, screened=screened)
     if not entries or entries[0].score - none.score < thresholds.least:
         return result
-    tied = [entry for entry in entries if _ties(entry, entries[0], thresholds)]
+    tied = [entry for entry in entries if _ties(entry, entries[0], none, thresholds)]
     # what more effects explain has to be worth them: another law of the same effect leaves a rest, too
     tied += [entry for entry in entries if entry not in tied and _suffices(entry, tied, none, thresholds)]
     tied = [
@@ -149,7 +151,7 @@ def decide(
     least = [entry for entry in tied if len(entry.candidate.effects) == fewest]
     sets = [entry for entry in least if not any(_has_special_case(entry, other) for other in least)]
     result.confusion = sorted(sets, key=lambda e: (len(bench.columns(e.candidate)), -e.score))
-    result.probabilities = _weigh(result, group)
+    result.probabilities = _weigh(result, group, thresholds.least / _resolution(entries[0], none, thresholds))
     result.verdict = "explained" if len(sets) == 1 else "ambiguous"
     return result
 
@@ -178,11 +180,20 @@ def _is_worth(entry: Entry, entries: Sequence[Entry], none: Entry, thresholds: T
     return all(left <= thresholds.worth * share_left(part.misfit, none.misfit) for part in parts)
 
 
-def _ties(entry: Entry, best: Entry, thresholds: Thresholds) -> bool:
-    """Whether a candidate predicts held-out windows as well as the best one, within the error of the difference."""
+def _ties(entry: Entry, best: Entry, none: Entry, thresholds: Thresholds) -> bool:
+    """Whether a candidate predicts held-out windows as well as the best one, within the error of the difference.
+
+    Where the best one leaves something, too, small differences say who mimics what is left rather than who is right.
+    """
     difference = best.scores - entry.scores
     error = difference.std(ddof=1) * np.sqrt(len(difference)) if len(difference) > 1 else 0.0
-    return float(difference.sum()) <= max(thresholds.tie * error, thresholds.least)
+    return float(difference.sum()) <= max(thresholds.tie * error, _resolution(best, none, thresholds))
+
+
+def _resolution(best: Entry, none: Entry, thresholds: Thresholds) -> float:
+    """Nats below which a difference of scores says nothing."""
+    blur = thresholds.blur * (best.score - none.score) if best.misfit.p_value < FALSE_ALARMS else 0.0
+    return max(thresholds.least, blur)
 
 
 def _contains(one: str, other: str) -> bool:
@@ -197,12 +208,13 @@ def _has_special_case(entry: Entry, other: Entry) -> bool:
     return len(mine) == len(theirs) == 1 and _contains(mine.pop(), theirs.pop())
 
 
-def _weigh(result: Diagnosis, group: Int[np.ndarray, " windows"]) -> list[float]:
+def _weigh(result: Diagnosis, group: Int[np.ndarray, " windows"], temper: float) -> list[float]:
     """How probable every set of the confusion set is.
 
-    Weights of all candidates by their held-out scores under the Bayesian bootstrap of the recordings, or of windows
-    where these are few; what a set left out as needlessly complex has goes to the sets that stand for it. Of that, the
-    share of the misfit that a set explains, and the chance that nothing outside the library looks like it.
+    Weights of all candidates by their held-out scores, tempered to what these can resolve, under the Bayesian
+    bootstrap of the recordings, or of windows where these are few; what a set left out as needlessly complex has goes
+    to the sets that stand for it. Of that, the share of the misfit that a set explains, and the chance that nothing
+    outside the library looks like it.
 
     Source: Yao et al. 2018, section 3.4 (pseudo-BMA+)
     """
@@ -210,7 +222,7 @@ def _weigh(result: Diagnosis, group: Int[np.ndarray, " windows"]) -> list[float]
     labels = sorted(set(units.tolist()))
     sums = np.array([[entry.scores[units == label].sum() for label in labels] for entry in result.entries])
     draws = np.random.default_rng(0).dirichlet(np.ones(len(labels)), BOOTSTRAPS) * len(labels)
-    z = draws @ sums.T
+    z = temper * (draws @ sums.T)
     weights = np.exp(z - z.max(1, keepdims=True))
     weights = (weights / weights.sum(1, keepdims=True)).mean(0)
     index = {id(entry): k for k, entry in enumerate(result.entries)}

@@ -40,6 +40,17 @@ def test_candidates_that_predict_alike_are_a_confusion_set():
     assert min(found.probabilities) > 0.01
 
 
+@pytest.mark.parametrize(("p", "wanted"), [(0.001, "ambiguous"), (0.4, "explained")])
+def test_small_differences_say_nothing_where_the_best_is_not_wholly_right(p, wanted):
+    """The second is worse by 0.3 % of what the best gains: far more than chance, and little against what both leave."""
+    best, second = entry(["a@x"], 1000.0, 0.002, p=p), entry(["b@x"], 997.0, 0.002, p=p)
+    found = verdict(best, second)
+    assert found.verdict == wanted
+    assert found.best.names == ["a@x"]
+    if wanted == "ambiguous":
+        assert found.probabilities[0] > found.probabilities[1] > 0.02
+
+
 def test_what_leaves_the_misfit_explains_nothing():
     assert verdict(entry(["a@x"], 100.0, 0.2)).verdict == "unexplained"
     assert verdict(entry(["a@x"], 100.0, 0.2, p=0.4)).verdict == "explained"
@@ -75,7 +86,7 @@ def test_more_effects_have_to_be_worth_it():
 def test_a_set_that_wins_in_few_recordings_is_less_probable():
     steady, rest = np.full(WINDOWS, 100.0), np.full(WINDOWS, 100.0)
     rest[:2] -= 4.0
-    first, second = entry(["a@x"], 0.0, 0.0), entry(["b@x"], 0.0, 0.0)
+    first, second = entry(["a@x"], 0.0, 0.0, p=0.4), entry(["b@x"], 0.0, 0.0, p=0.4)
     first.scores, second.scores = steady, rest
     found = verdict(first, second)
     assert found.verdict == "ambiguous"
