@@ -19,8 +19,17 @@ from bayessim_jax.beliefs.margins import Margins
 from bayessim_jax.diagnosis.bench import SLOTS, Bench, Candidate
 from bayessim_jax.diagnosis.response import Motion, cross_validate
 from bayessim_jax.diagnosis.scene import Scene
-from bayessim_jax.diagnosis.screen import LEAST_SHARE, Screen, Screened
-from bayessim_jax.diagnosis.verdict import Diagnosis, Entry, Thresholds, are_kin, decide, error_left, share_left
+from bayessim_jax.diagnosis.screen import LEAST_SHARE, Begun, Screen, Screened
+from bayessim_jax.diagnosis.verdict import (
+    Diagnosis,
+    Entry,
+    Thresholds,
+    are_kin,
+    decide,
+    error_left,
+    explains,
+    share_left,
+)
 from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, judge_misfit
 from bayessim_jax.effects import Scales
 from bayessim_jax.inference.direct import noise_floor, noise_level
@@ -149,7 +158,8 @@ def name_effects(
     say(f"holding {len(problem.pairs)} candidates against the recorded motion")
     nothing = screen.begin(start.z[: screen.d], start.sigma)
     random = np.random.default_rng(0)
-    ranked, listed = _rank(screen, nothing, random, say)
+    ranked, begun = _rank(screen, nothing, random, say)
+    listed = [(screen.name(each.candidate), each.likelihood - nothing.score) for each in begun]
     if not ranked:
         return Diagnosis("unexplained", *detect(key, problem, _still(problem, start)), [])
     singles = _finalists(screen, nothing, ranked)
@@ -157,12 +167,13 @@ def name_effects(
     none = _without(work, problem, detected)
     entries = _finish(work, none, singles, problem.ahead)
     left = share_left(entries[0].misfit, none.misfit) if entries else 1.0
-    if left > thresholds.enough:
+    explained = bool(entries) and explains(entries[0], none, thresholds)
+    if left > thresholds.enough or not explained:
         say("one effect is not enough: trying pairs")
         before = screen.misfit(key, nothing)
         remain = lambda found: share_left(screen.misfit(key, found), before)  # noqa: E731
-        worth = thresholds.worth * remain(ranked[0]) if left <= thresholds.left else np.inf
-        pairs = [pair for pair in _pair(screen, ranked, random)[:PAIRS] if remain(pair) < worth]
+        worth = thresholds.worth * remain(ranked[0]) if explained else np.inf
+        pairs = [pair for pair in _pair(screen, ranked, begun, random)[:PAIRS] if remain(pair) < worth]
         if pairs:
             alone = {k for pair in pairs for k in pair.candidate.effects}
             best = {work.numbers[k] for entry in entries[:2] for k in entry.candidate.effects}
@@ -186,8 +197,8 @@ def _bench_of(key: PRNGKeyArray, problem: Problem, candidates: Sequence[Screened
 
 def _rank(
     screen: Screen, nothing: Screened, random: np.random.Generator, say: Callable[[str], None]
-) -> tuple[list[Screened], list[tuple[str, float]]]:
-    """The best single effects, the best first; and every one with what it gains where it was fitted."""
+) -> tuple[list[Screened], list[Begun]]:
+    """The best single effects, and all that could be begun; both the best first."""
     every = []
     for k in range(len(screen.pairs)):
         candidate = Candidate((k,))
@@ -199,7 +210,7 @@ def _rank(
     every.sort(key=lambda begun: -begun.likelihood)
     ended = [screen.finish_candidate(begun, nothing) for begun in every[:FINISHED]]
     ranked = sorted((e for e in ended if e is not None), key=lambda e: -e.score)
-    return ranked, [(screen.name(begun.candidate), begun.likelihood - nothing.score) for begun in every]
+    return ranked, every
 
 
 def _finalists(screen: Screen, nothing: Screened, ranked: Sequence[Screened]) -> list[Screened]:
@@ -218,10 +229,13 @@ def _finalists(screen: Screen, nothing: Screened, ranked: Sequence[Screened]) ->
     ]
 
 
-def _pair(screen: Screen, ranked: Sequence[Screened], random: np.random.Generator) -> list[Screened]:
+def _pair(
+    screen: Screen, ranked: Sequence[Screened], begun: Sequence[Begun], random: np.random.Generator
+) -> list[Screened]:
     """Pairs of the best single effects with every other one, then of the best pair's members, the best first."""
     found: list[Screened] = []
     seen: set[Candidate] = set()
+    alone = {each.candidate.effects[0]: screen.own(each) for each in begun}
 
     def extend(known: Screened) -> None:
         first = []
@@ -230,13 +244,13 @@ def _pair(screen: Screen, ranked: Sequence[Screened], random: np.random.Generato
             if len(pair.effects) < 2 or pair in seen or not screen.takes(pair):
                 continue
             seen.add(pair)
-            cost = screen.glance(pair, known)
+            cost = screen.glance(pair, known, alone.get(k))
             if np.isfinite(cost):
                 first.append((cost, pair))
         first.sort(key=lambda item: item[0])
         for _, pair in first[:GLANCED]:
-            begun = screen.begin_candidate(pair, known, random)
-            ended = screen.finish_candidate(begun, known) if begun is not None else None
+            started = screen.begin_candidate(pair, known, random)
+            ended = screen.finish_candidate(started, known) if started is not None else None
             found.extend([ended] if ended is not None else [])
 
     for known in ranked[:LEADERS]:

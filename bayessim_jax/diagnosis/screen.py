@@ -34,7 +34,7 @@ LASTING = 8
 LEAST_SHARE = 0.2
 """Of the numbers measured, that noise is taken to have in the residuals however many are fitted."""
 GLANCING = 6
-"""Steps of the solver from each of two points, by which partners of a known effect are ranked."""
+"""Steps of the solver from each of a few points, by which partners of a known effect are ranked."""
 STRAYED = 1.5
 """Of θ's z: where the simulator without an effect was driven further out, a candidate also begins from the middle."""
 DRAWS, ASIDE = 4, 0.7
@@ -218,16 +218,26 @@ class Screen:
         residual = np.asarray(r * found.sigma)
         return judge_misfit(key, residual, unscaled.reshape(len(slopes), n, -1), np.asarray(self.shots.measured))
 
-    def glance(self, candidate: Candidate, known: Screened) -> float:
-        """The cost of a candidate after a few steps from a fit of a part of it, what is added nearly neutral or not."""
+    def own(self, begun: Begun) -> Float[np.ndarray, " e"]:
+        """The candidate's own numbers where it was fitted best."""
+        return np.asarray(begun.ends[0][0])[self.d : self.d + self.scene.count(begun.candidate)]
+
+    def glance(self, candidate: Candidate, known: Screened, alone: Float[np.ndarray, " e"] | None = None) -> float:
+        """The cost of a candidate after a few steps from a fit of a part of it.
+
+        What is added begins nearly neutral, as usual, or as it was fitted `alone`.
+        """
         held = dict(self.offsets(known.candidate))
         added = Candidate(tuple(k for k in candidate.effects if k not in held))
         own = dict(self.offsets(added))
         each = [q for k in added.effects for q in zip(self.scene.parameters[k], self.scene.margin[k], strict=True)]
+        starts = [
+            np.array([float(m.standard(jnp.asarray(begin_value(p, share), float))) for p, m in each])
+            for share in (NEAR, 1.0)
+        ]
         costs = []
-        for share in (NEAR, 1.0):
-            start = [float(m.standard(jnp.asarray(begin_value(p, share), float))) for p, m in each]
-            p = self._put(candidate, known, held, own, np.array(start))
+        for start in [*starts, *([alone] if alone is not None else [])]:
+            p = self._put(candidate, known, held, own, start)
             found = self.fit(candidate, p, known.delta, known.sigma, GLANCING)
             costs.append(np.inf if found[2] is None else float(found[2].cost))
         return min(costs)

@@ -12,7 +12,7 @@ from bayessim_jax.diagnosis.bench import Bench, Candidate
 from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, Misfit
 from bayessim_jax.inference.shooting import Fit, Shots
 
-__all__ = ["CONTAINS", "Diagnosis", "Entry", "Thresholds", "are_kin", "decide", "error_left", "share_left"]
+__all__ = ["CONTAINS", "Diagnosis", "Entry", "Thresholds", "are_kin", "decide", "error_left", "explains", "share_left"]
 
 CONTAINS = {
     "stribeck_friction": ("coulomb_friction",),
@@ -38,6 +38,8 @@ class Thresholds:
     """Power of a misfit over that of the noise, below which it is none."""
     left: float = 0.03
     """Share of the baseline's misfit that an explanation may leave."""
+    ahead: float = 0.5
+    """Share of the baseline's error of predictions ahead that an explanation of the misfit may leave."""
     enough: float = 0.015
     """Share that a single effect may leave before pairs are tried."""
     worth: float = 0.4
@@ -60,8 +62,8 @@ class Entry:
     scores: Float[np.ndarray, " windows"]
     """Log predictive density of every window, its initial state profiled out."""
     misfit: Misfit
-    ahead: float = 1.0
-    """Share of the baseline's error that predictions as long as the horizon still have beyond the noise."""
+    ahead: float = float("nan")
+    """Share of the baseline's error that predictions as long as the horizon still have beyond the noise, if known."""
 
     @property
     def score(self) -> float:
@@ -143,7 +145,7 @@ def decide(
     # what more effects explain has to be worth them: another law of the same effect leaves a rest, too
     tied += [entry for entry in entries if entry not in tied and _suffices(entry, tied, none, thresholds)]
     tied = [
-        entry for entry in tied if _explains(entry, none, thresholds) and _is_worth(entry, entries, none, thresholds)
+        entry for entry in tied if explains(entry, none, thresholds) and _is_worth(entry, entries, none, thresholds)
     ]
     if not tied:
         return result
@@ -156,15 +158,19 @@ def decide(
     return result
 
 
-def _explains(entry: Entry, none: Entry, thresholds: Thresholds) -> bool:
-    """In the residuals of pieces of windows, or, where the sensors' own errors are what is left there, ahead."""
-    left = min(share_left(entry.misfit, none.misfit), entry.ahead)
-    return left <= thresholds.left or entry.misfit.p_value >= FALSE_ALARMS
+def explains(entry: Entry, none: Entry, thresholds: Thresholds) -> bool:
+    """In the residuals of pieces of windows, or, where the sensors' own errors are what is left there, ahead.
+
+    What explains pieces and predicts hardly better than without it has found a small thing beside a larger one.
+    """
+    if entry.misfit.p_value >= FALSE_ALARMS or entry.ahead <= thresholds.left:
+        return True
+    return share_left(entry.misfit, none.misfit) <= thresholds.left and not entry.ahead > thresholds.ahead
 
 
 def _suffices(entry: Entry, tied: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:
     """Whether a candidate explains the misfit, and those that tie for the best add effects to it without much gain."""
-    if not _explains(entry, none, thresholds):
+    if not explains(entry, none, thresholds):
         return False
     left = share_left(entry.misfit, none.misfit)
     return all(

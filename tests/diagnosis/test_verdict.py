@@ -58,6 +58,16 @@ def test_what_leaves_the_misfit_explains_nothing():
     assert verdict().verdict == "unexplained"
 
 
+def test_what_explains_pieces_and_predicts_no_better_explains_nothing():
+    found = entry(["a@x"], 100.0, 0.002)
+    for ahead, wanted in ((0.95, "unexplained"), (0.2, "explained")):
+        found.ahead = ahead
+        assert verdict(found).verdict == wanted
+    rough = entry(["a@x"], 100.0, 0.3)
+    rough.ahead = 0.01
+    assert verdict(rough).verdict == "explained"
+
+
 def test_a_tie_with_what_does_not_explain_is_no_confusion():
     assert verdict(entry(["a@x"], 100.0, 0.002), entry(["b@x"], 100.0, 0.3, seed=1)).verdict == "explained"
 
