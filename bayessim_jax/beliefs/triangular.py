@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from bayessim_jax.contracts import Scalar
 
-__all__ = ["factor", "invert", "log_normal"]
+__all__ = ["factor", "invert", "log_normal", "solve_lower"]
 
 
 def factor(a: Float[Array, "d m"]) -> Float[Array, "d d"]:
@@ -23,13 +22,26 @@ def factor(a: Float[Array, "d m"]) -> Float[Array, "d d"]:
     return lower + jnp.diag(jnp.maximum(jnp.diagonal(lower), floor) - jnp.diagonal(lower))
 
 
+def solve_lower(lower: Float[Array, "d d"], b: Float[Array, "d *m"]) -> Float[Array, "d *m"]:
+    """L⁻¹ b of a lower triangular L by forward substitution, written out: d is small.
+
+    In batches this is quicker than LAPACK, and it cannot wait: two batched triangular solves at once can block each
+    other for ever on a machine with two cores (jaxlib 0.10).
+    """
+    rows: list[Array] = []
+    for i in range(lower.shape[-1]):
+        known = [lower[i, j] * row for j, row in enumerate(rows)]
+        rows.append((b[i] - sum(known, jnp.zeros_like(b[i]))) / lower[i, i])
+    return jnp.stack(rows)
+
+
 def invert(lower: Float[Array, "d d"]) -> Float[Array, "d d"]:
     """L⁻¹ of a lower triangular L."""
-    return solve_triangular(lower, jnp.eye(lower.shape[-1], dtype=lower.dtype), lower=True)
+    return solve_lower(lower, jnp.eye(lower.shape[-1], dtype=lower.dtype))
 
 
 def log_normal(difference: Float[Array, " d"], lower: Float[Array, "d d"]) -> Scalar:
     """Log density log N(x; μ, L Lᵀ) for x − μ = `difference`."""
-    white = solve_triangular(lower, difference, lower=True)
+    white = solve_lower(lower, difference)
     scale = jnp.log(jnp.diagonal(lower)).sum() + 0.5 * difference.shape[-1] * jnp.log(2 * jnp.pi)
     return -0.5 * (white**2).sum() - scale

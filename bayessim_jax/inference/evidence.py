@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from bayessim_jax.beliefs import GaussianMixture, moment_match
+from bayessim_jax.beliefs.triangular import invert
 
 __all__ = ["combine_evidence"]
 
@@ -24,7 +25,8 @@ def combine_evidence(each: GaussianMixture, use: Bool[Array, " set"]) -> Gaussia
 
     def evidence(mixture: GaussianMixture) -> tuple[Array, Array]:
         mean, tril = moment_match(mixture)
-        precision = jax.scipy.linalg.cho_solve((tril, True), jnp.eye(mean.size))
+        inverse = invert(tril)
+        precision = inverse.T @ inverse
         values, axes = jnp.linalg.eigh(precision)
         added = jnp.maximum(values - 1.0, 0.0)
         weighed = jnp.where(added > 0, values * (axes.T @ mean), 0.0)

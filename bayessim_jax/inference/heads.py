@@ -10,6 +10,7 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from bayessim_jax.beliefs.mixture import GaussianMixture
+from bayessim_jax.beliefs.triangular import invert
 from bayessim_jax.inference.encoders import glorot
 
 __all__ = ["MixtureHead"]
@@ -73,8 +74,7 @@ class MixtureHead:
     def mixture(self, params: Any, x: Float[Array, " inputs"]) -> GaussianMixture:
         """q(z | x) as a belief."""
         log_weights, means, factors = self.apply(params, x)
-        d = means.shape[-1]
-        inverse = jax.scipy.linalg.solve_triangular(factors, jnp.broadcast_to(jnp.eye(d), factors.shape), lower=True)
+        inverse = jax.vmap(invert)(factors)
         covariance = inverse @ jnp.swapaxes(inverse, -1, -2)
         return GaussianMixture(log_weights, means, jnp.linalg.cholesky(covariance))
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from scipy.special import chdtr, chdtri
 
 from bayessim_jax.beliefs import GaussianMixture, moment_match
+from bayessim_jax.beliefs.triangular import invert, solve_lower
 from bayessim_jax.contracts import Scalar
 
 __all__ = [
@@ -75,7 +76,7 @@ class Recalibration:
     def apply(self, mixture: GaussianMixture) -> GaussianMixture:
         """θ ↦ μ + L (shift + stretch L⁻¹ (θ − μ))."""
         mean, tril = moment_match(mixture)
-        inverse = jax.scipy.linalg.solve_triangular(tril, jnp.eye(mean.size), lower=True)
+        inverse = invert(tril)
         linear = tril @ self.stretch @ inverse
         return GaussianMixture(
             mixture.log_weights,
@@ -117,7 +118,7 @@ def regress(
 
     def whiten(mixture: GaussianMixture, truth: Array) -> tuple[Array, Array]:
         mean, tril = moment_match(mixture)
-        return mean, jax.scipy.linalg.solve_triangular(tril, truth - mean, lower=True)
+        return mean, solve_lower(tril, truth - mean)
 
     d, n = truths.shape[1], weights.sum()
     means, r = jax.vmap(whiten)(mixtures, truths)

@@ -50,7 +50,7 @@ def _library(model: CaseModel) -> Motions:
     qpos, qvel = (np.concatenate([getattr(r, n) for r in model.recordings]) for n in ("qpos", "qvel"))
     library, starts = [], []
     for name, signal in commands(recorded, layout.ctrl, rows, dt):
-        if np.ptp(signal) > 0:
+        if signal.size and np.ptp(signal) > 0:
             library.append((name, signal))
             starts.append((first.qpos[0], first.qvel[0]))
             continue
