@@ -32,7 +32,7 @@ from bayessim_jax.diagnosis.verdict import (
 )
 from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, judge_misfit
 from bayessim_jax.effects import Scales
-from bayessim_jax.inference.direct import noise_floor, noise_level
+from bayessim_jax.inference.direct import estimate_noise, noise_floor
 from bayessim_jax.inference.shooting import Fit, Shots
 from bayessim_jax.systems.mjcf import MjcfSystem
 
@@ -52,6 +52,8 @@ DOUBT = 0.05
 """Probability that a model fails in a window, where the simulator without effects then predicts."""
 WORKERS = 2
 """Candidates that are simulated at the same time; what one finds does not depend on the others."""
+ROUNDS = 4
+"""Of a fit and its noise, at most."""
 FOLDS = 4
 """Groups of recordings, each scored by fits to the others."""
 
@@ -73,15 +75,13 @@ class _Work:
         """Windows that are scored by fits to the others."""
         return _folds(self.group)
 
-    def settle(self, candidate: Candidate, fit: Fit, rounds: int = 4, steps: int = 12) -> Fit:
+    def settle(self, candidate: Candidate, fit: Fit) -> Fit:
         """Fit a candidate and its noise in turn."""
-        counts = np.asarray(self.bench.shots.measured).sum((0, 1))
-        fitted = self.bench.d + len(self.bench.columns(candidate)) + fit.delta.size
-        for _ in range(rounds):
-            squares = (np.asarray(fit.misses) ** 2).sum((0, 1))
-            sigma = noise_level(squares, counts, fitted, self.floor, LEAST_SHARE)
+        free = self.bench.d + len(self.bench.columns(candidate))
+        for _ in range(ROUNDS):
+            sigma = estimate_noise(self.bench.shots, fit, self.floor, free, LEAST_SHARE)
             change = float(jnp.abs(jnp.log(sigma / fit.sigma)).max())
-            fit = self.bench.fit(candidate, fit.z, fit.delta, sigma, steps=steps)
+            fit = self.bench.fit(candidate, fit.z, fit.delta, sigma)
             if change < 0.03:
                 break
         return fit
@@ -272,7 +272,7 @@ def _without(work: _Work, problem: Problem, detected: Entry) -> Entry:
     """The simulator without effects on a bench that holds some; its fit and test are the ones of whole windows."""
     nothing, start = Candidate(), _still(problem, detected.fit)
     x = work.bench.starts(nothing, start.z[: work.bench.d])[0]
-    fit = work.bench.fit(nothing, x, start.delta, start.sigma, steps=12)
+    fit = work.bench.fit(nothing, x, start.delta, start.sigma)
     entry = _enter(work, nothing, work.settle(nothing, fit))
     entry.misfit = dataclasses.replace(entry.misfit, p_value=detected.misfit.p_value)
     entry.fit = dataclasses.replace(fit, z=x.at[: work.bench.d].set(start.z[: work.bench.d]))
@@ -287,7 +287,7 @@ def _finish(work: _Work, none: Entry, candidates: Sequence[Screened], ahead: Sho
     def finish(found: Screened) -> Entry | None:
         own = Candidate(tuple(work.numbers.index(k) for k in found.candidate.effects))
         delta, sigma = jnp.zeros_like(none.fit.delta), jnp.maximum(found.sigma, work.floor)
-        fit = bench.fit(own, found.p, delta, sigma, steps=12)
+        fit = bench.fit(own, found.p, delta, sigma)
         if not np.isfinite(float(fit.cost)):
             return None
         entry = _enter(work, own, work.settle(own, fit))

@@ -92,11 +92,6 @@ class Scene:
         """Parameters of the system."""
         return self.margins.size
 
-    @property
-    def length(self) -> float:
-        """Of a window, s."""
-        return self.motion.ctrl.shape[1] * self.system.dt
-
     def count(self, candidate: Candidate) -> int:
         """Parameters of a candidate."""
         return sum(len(self.parameters[k]) for k in candidate.effects)
@@ -232,13 +227,12 @@ class Scene:
         kinds, x, (low, high) = self.kinds[e], p[place], self.ranges[e]
         if effect.port == "force":
             other = self._joint(site.other, around, ()) if site.other >= 0 else None
-            seen, earlier = (self.h, self.fine, x, low, high, self.times, joint, other), self.motion.earlier
-            if effect.recalls and earlier is not None and earlier[0].shape[1]:
+            earlier = None
+            if effect.recalls and self.motion.earlier is not None:
                 places = int(self.model.jnt_qposadr[site.joint]), self._dof(site.joint)
-                moved = tuple(rows[..., k] for rows, k in zip(earlier, places, strict=True))
-                f, along = force_of(effect, kinds, site.detail, *seen, moved, self.system.dt)
-            else:
-                f, along = force_of(effect, kinds, site.detail, *seen)
+                earlier = tuple(rows[..., k] for rows, k in zip(self.motion.earlier, places, strict=True))
+            seen = (self.h, self.fine, x, low, high, self.times, joint, other, earlier, self.system.dt)
+            f, along = force_of(effect, kinds, site.detail, *seen)
             return [(self._dof(site.joint), f, along, place.start)]
         gains = self._gains(site.actuators, around)
         commands, older, coarse, before = self._commands(site.actuators, effect.looks)

@@ -7,7 +7,6 @@ hundredths of a second, so that pairs are tried as well. What comes out on top i
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import chain, product
 from typing import Any
@@ -22,10 +21,12 @@ from bayessim_jax.diagnosis.response import propose
 from bayessim_jax.diagnosis.scene import Scene
 from bayessim_jax.diagnosis.whiteness import Misfit, judge_misfit
 from bayessim_jax.inference.direct import noise_floor, noise_level
+from bayessim_jax.inference.shooting import in_units
 
 __all__ = ["Begun", "Screen", "Screened"]
 
-ITERATIONS = 6
+ITERATIONS, AGAIN = 6, 3
+"""Steps of the solver with the noise of before, and then with its own."""
 RACES = ((3, False, 4), (4, True, 2), (6, True, 2))
 """Steps of the solver from the points that a candidate is begun from, whether parameters that are scanned move, and how
 many points go on; one race after the other."""
@@ -147,13 +148,12 @@ class Screen:
         p: Float[Array, " k"] | np.ndarray,
         delta: Array,
         sigma: Array,
-        rounds: int = 2,
         iterations: int = ITERATIONS,
     ) -> Screened | None:
         """Fit a candidate and its noise in turn, and score it."""
         own = self.scene.count(candidate)
-        for k in range(rounds):
-            p, delta, curvature, r, _ = self.fit(candidate, p, delta, sigma, iterations if k == 0 else 3)
+        for steps in (iterations, AGAIN):
+            p, delta, curvature, r, _ = self.fit(candidate, p, delta, sigma, steps)
             if curvature is None:
                 return None
             squares = (np.asarray(r) ** 2).sum((0, 1)) * np.asarray(sigma) ** 2
@@ -173,10 +173,8 @@ class Screen:
 
     def begin_candidate(self, candidate: Candidate, known: Screened, random: np.random.Generator) -> Begun | None:
         """Fit a candidate from several points beside a fit without it; `known` may hold some of its effects already."""
-        held = dict(self.offsets(known.candidate))
-        added = Candidate(tuple(k for k in candidate.effects if k not in held))
-        new = dict(self.offsets(added))
-        points = [self._put(candidate, known, held, new, start) for start in self.starts(added, random)]
+        added = Candidate(tuple(k for k in candidate.effects if k not in known.candidate.effects))
+        points = [self._put(added, known, start) for start in self.starts(added, random)]
         strayed = (np.arange(self.d + self.slots) < self.d) & (np.abs(known.p) > STRAYED)
         if strayed.any():
             points += [np.where(strayed, 0.0, point) for point in points]
@@ -214,9 +212,8 @@ class Screen:
         """What a candidate leaves of the misfit."""
         _, r, slopes = self.scene.assess(found.candidate, np.asarray(found.p), found.delta, found.sigma)
         n = found.delta.shape[-1]
-        unscaled = slopes[:, -n:].reshape(len(slopes), n, *r.shape[1:]) * found.sigma
-        residual = np.asarray(r * found.sigma)
-        return judge_misfit(key, residual, unscaled.reshape(len(slopes), n, -1), np.asarray(self.shots.measured))
+        own, residual = in_units(slopes[:, -n:], found.sigma), np.asarray(r * found.sigma)
+        return judge_misfit(key, residual, own, np.asarray(self.shots.measured))
 
     def own(self, begun: Begun) -> Float[np.ndarray, " e"]:
         """The candidate's own numbers where it was fitted best."""
@@ -227,9 +224,7 @@ class Screen:
 
         What is added begins nearly neutral, as usual, or as it was fitted `alone`.
         """
-        held = dict(self.offsets(known.candidate))
-        added = Candidate(tuple(k for k in candidate.effects if k not in held))
-        own = dict(self.offsets(added))
+        added = Candidate(tuple(k for k in candidate.effects if k not in known.candidate.effects))
         each = [q for k in added.effects for q in zip(self.scene.parameters[k], self.scene.margin[k], strict=True)]
         starts = [
             np.array([float(m.standard(jnp.asarray(begin_value(p, share), float))) for p, m in each])
@@ -237,22 +232,16 @@ class Screen:
         ]
         costs = []
         for start in [*starts, *([alone] if alone is not None else [])]:
-            p = self._put(candidate, known, held, own, start)
+            p = self._put(added, known, start)
             found = self.fit(candidate, p, known.delta, known.sigma, GLANCING)
             costs.append(np.inf if found[2] is None else float(found[2].cost))
         return min(costs)
 
-    def _put(
-        self,
-        candidate: Candidate,
-        known: Screened,
-        held: Mapping[int, slice],
-        own: Mapping[int, slice],
-        start: np.ndarray,
-    ) -> np.ndarray:
-        """A candidate's p, with what is known of some of its effects and a start for the others."""
+    def _put(self, added: Candidate, known: Screened, start: Float[np.ndarray, " e"]) -> Float[np.ndarray, " k"]:
+        """The p of what is known with effects added to it, which begin at `start`."""
         p = np.zeros(self.d + self.slots)
         p[: self.d] = known.p[: self.d]
-        for k, place in self.offsets(candidate):
+        own, held = dict(self.offsets(added)), dict(self.offsets(known.candidate))
+        for k, place in self.offsets(known.candidate + added):
             p[place] = known.p[held[k]] if k in held else start[own[k].start - self.d : own[k].stop - self.d]
         return p

@@ -54,11 +54,17 @@ class DirectPosterior:
     sampler: str = struct.field(pytree_node=False)
 
 
-def estimate_noise(shots: Shots, fit: Fit, floor: Float[Array, " obs"]) -> Float[Array, " obs"]:
-    """Noise of every channel from what a fit leaves, √(Σ r² / (n (1 − k/N))) for k numbers fitted to N, or `floor`."""
+LEAST_SHARE = 0.1
+"""Of the numbers measured, that noise is taken to have in the residuals however many are fitted."""
+
+
+def estimate_noise(
+    shots: Shots, fit: Fit, floor: Float[Array, " obs"], free: int | None = None, least: float = LEAST_SHARE
+) -> Float[Array, " obs"]:
+    """Noise of every channel from what a fit leaves; of z so many are `free`, all unless told (`noise_level`)."""
     counts = np.asarray(shots.measured).sum((0, 1))
     squares = (np.asarray(fit.misses) ** 2).sum((0, 1))
-    return noise_level(squares, counts, fit.z.size + fit.delta.size, floor)
+    return noise_level(squares, counts, (fit.z.size if free is None else free) + fit.delta.size, floor, least)
 
 
 def noise_level(
@@ -66,7 +72,7 @@ def noise_level(
     counts: Float[np.ndarray, " obs"],
     fitted: int,
     floor: Float[Array, " obs"],
-    least: float = 0.1,
+    least: float = LEAST_SHARE,
 ) -> Float[Array, " obs"]:
     """√(Σ r² / (n (1 − k/N))) of every channel for k numbers fitted to N, or `floor`; 1 − k/N is at least `least`."""
     share = max(1.0 - fitted / max(counts.sum(), 1), least)

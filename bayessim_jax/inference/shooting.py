@@ -32,6 +32,7 @@ __all__ = [
     "Predict",
     "Shots",
     "expand",
+    "in_units",
     "normal_equations",
     "Ridge",
     "profile",
@@ -107,9 +108,12 @@ class Fit:
     @property
     def along_states(self) -> Float[Array, "windows n k"]:
         """Derivatives of predictions along δ/S, in the channels' units."""
-        windows, rows, obs = self.r.shape
-        own = self.slopes[:, self.z.size :]
-        return (own.reshape(windows, -1, rows, obs) * self.sigma).reshape(own.shape)
+        return in_units(self.slopes[:, self.z.size :], self.sigma)
+
+
+def in_units(slopes: Float[Array, "windows n k"], sigma: Float[Array, " obs"]) -> Float[Array, "windows n k"]:
+    """Derivatives of predictions / σ, rows and channels in one axis, in the channels' units."""
+    return (slopes.reshape(*slopes.shape[:-1], -1, sigma.size) * sigma).reshape(slopes.shape)
 
 
 def residuals(predict: Predict, shots: Shots, z: Array, delta: Array, sigma: Array) -> Float[Array, "windows rows obs"]:
