@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain
-from typing import Any
+from itertools import chain, count
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +38,8 @@ from bayessim_jax.systems.mjcf import MjcfSystem
 
 __all__ = ["Problem", "detect", "is_mismatch", "name_effects"]
 
+T, R = TypeVar("T"), TypeVar("R")
+
 SCREENED = 60
 """Windows with which every candidate is tried at first."""
 FINALISTS, LEADERS, PAIRS = 7, 2, 4
@@ -51,7 +53,7 @@ WORTH = 0.5
 DOUBT = 0.05
 """Probability that a model fails in a window, where the simulator without effects then predicts."""
 WORKERS = 2
-"""Candidates that are simulated at the same time; what one finds does not depend on the others."""
+"""Candidates that are tried at the same time."""
 ROUNDS = 4
 """Of a fit and its noise, at most."""
 FOLDS = 4
@@ -155,10 +157,10 @@ def name_effects(
     """
     thresholds = thresholds or Thresholds()
     screen, start = problem.screen(problem.pairs), detected.fit
+    screens = [screen, *(screen.twin() for _ in range(1, WORKERS))]
     say(f"holding {len(problem.pairs)} candidates against the recorded motion")
     nothing = screen.begin(start.z[: screen.d], start.sigma)
-    random = np.random.default_rng(0)
-    ranked, begun = _rank(screen, nothing, random, say)
+    ranked, begun = _rank(screens, nothing, say)
     listed = [(screen.name(each.candidate), each.likelihood - nothing.score) for each in begun]
     if not ranked:
         return Diagnosis("unexplained", *detect(key, problem, _still(problem, start)), [])
@@ -173,7 +175,7 @@ def name_effects(
         before = screen.misfit(key, nothing)
         remain = lambda found: share_left(screen.misfit(key, found), before)  # noqa: E731
         worth = thresholds.worth * remain(ranked[0]) if explained else np.inf
-        pairs = [pair for pair in _pair(screen, ranked, begun, random)[:PAIRS] if remain(pair) < worth]
+        pairs = [pair for pair in _pair(screens, ranked, begun)[:PAIRS] if remain(pair) < worth]
         if pairs:
             alone = {k for pair in pairs for k in pair.candidate.effects}
             best = {work.numbers[k] for entry in entries[:2] for k in entry.candidate.effects}
@@ -195,22 +197,35 @@ def _bench_of(key: PRNGKeyArray, problem: Problem, candidates: Sequence[Screened
     return _Work(key, bench, problem.group, noise_floor(bench.shots), say, tuple(numbers))
 
 
+def _each(screens: Sequence[Screen], items: Sequence[T], do: Callable[[Screen, T], R]) -> list[R]:
+    """`do` for every item, by as many threads as screens; which screen does what is fixed, so that runs repeat."""
+
+    def share(i: int) -> list[R]:
+        return [do(screens[i], item) for item in items[i :: len(screens)]]
+
+    with ThreadPoolExecutor(len(screens)) as pool:
+        shares = list(pool.map(share, range(len(screens))))
+    return [shares[i % len(screens)][i // len(screens)] for i in range(len(items))]
+
+
 def _rank(
-    screen: Screen, nothing: Screened, random: np.random.Generator, say: Callable[[str], None]
+    screens: Sequence[Screen], nothing: Screened, say: Callable[[str], None]
 ) -> tuple[list[Screened], list[Begun]]:
     """The best single effects, and all that could be begun; both the best first."""
-    every = []
-    for k in range(len(screen.pairs)):
-        candidate = Candidate((k,))
-        begun = screen.begin_candidate(candidate, nothing, random) if screen.takes(candidate) else None
-        if begun is not None and np.isfinite(begun.likelihood):
-            every.append(begun)
-        if k % 40 == 39:
-            say(f"{k + 1} of {len(screen.pairs)}")
+    singles = [Candidate((k,)) for k in range(len(screens[0].pairs)) if screens[0].takes(Candidate((k,)))]
+    done = count(1)
+
+    def begin(screen: Screen, candidate: Candidate) -> Begun | None:
+        begun = screen.begin_candidate(candidate, nothing)
+        k = next(done)
+        if k % 40 == 0:
+            say(f"{k} of {len(singles)}")
+        return begun
+
+    every = [begun for begun in _each(screens, singles, begin) if begun and np.isfinite(begun.likelihood)]
     every.sort(key=lambda begun: -begun.likelihood)
-    ended = [screen.finish_candidate(begun, nothing) for begun in every[:FINISHED]]
-    ranked = sorted((e for e in ended if e is not None), key=lambda e: -e.score)
-    return ranked, every
+    ended = _each(screens, every[:FINISHED], lambda screen, begun: screen.finish_candidate(begun, nothing))
+    return sorted((e for e in ended if e is not None), key=lambda e: -e.score), every
 
 
 def _finalists(screen: Screen, nothing: Screened, ranked: Sequence[Screened]) -> list[Screened]:
@@ -229,29 +244,28 @@ def _finalists(screen: Screen, nothing: Screened, ranked: Sequence[Screened]) ->
     ]
 
 
-def _pair(
-    screen: Screen, ranked: Sequence[Screened], begun: Sequence[Begun], random: np.random.Generator
-) -> list[Screened]:
+def _pair(screens: Sequence[Screen], ranked: Sequence[Screened], begun: Sequence[Begun]) -> list[Screened]:
     """Pairs of the best single effects with every other one, then of the best pair's members, the best first."""
     found: list[Screened] = []
     seen: set[Candidate] = set()
-    alone = {each.candidate.effects[0]: screen.own(each) for each in begun}
+    first = screens[0]
+    alone = {each.candidate.effects[0]: first.own(each) for each in begun}
 
     def extend(known: Screened) -> None:
-        first = []
-        for k in range(len(screen.pairs)):
-            pair = known.candidate + Candidate((k,))
-            if len(pair.effects) < 2 or pair in seen or not screen.takes(pair):
-                continue
-            seen.add(pair)
-            cost = screen.glance(pair, known, alone.get(k))
-            if np.isfinite(cost):
-                first.append((cost, pair))
-        first.sort(key=lambda item: item[0])
-        for _, pair in first[:GLANCED]:
-            started = screen.begin_candidate(pair, known, random)
-            ended = screen.finish_candidate(started, known) if started is not None else None
-            found.extend([ended] if ended is not None else [])
+        pairs = {known.candidate + Candidate((k,)): k for k in range(len(first.pairs))}
+        tried = [pair for pair in pairs if len(pair.effects) == 2 and pair not in seen and first.takes(pair)]
+        seen.update(tried)
+        costs = _each(screens, tried, lambda screen, pair: screen.glance(pair, known, alone.get(pairs[pair])))
+        best = sorted(
+            (item for item in zip(costs, tried, strict=True) if np.isfinite(item[0])), key=lambda item: item[0]
+        )
+
+        def finish(screen: Screen, pair: Candidate) -> Screened | None:
+            started = screen.begin_candidate(pair, known)
+            return screen.finish_candidate(started, known) if started is not None else None
+
+        ended = _each(screens, [pair for _, pair in best], finish)
+        found.extend(each for each in ended if each is not None)
 
     for known in ranked[:LEADERS]:
         extend(known)
@@ -259,7 +273,7 @@ def _pair(
     best = max(found, key=lambda item: item.score, default=None)
     for k in best.candidate.effects if best else ():
         if best and k not in led:
-            extend(screen.part(best, k))
+            extend(first.part(best, k))
     return sorted(found, key=lambda item: -item.score)
 
 

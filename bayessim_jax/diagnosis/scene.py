@@ -6,6 +6,7 @@ model change the steps around it. What does not depend on a candidate is compute
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from bayessim_jax.beliefs.margins import Margin, Margins
 from bayessim_jax.diagnosis.bench import SLOTS, Candidate, margin_of_effect
@@ -34,7 +35,7 @@ __all__ = ["Scene"]
 FINE = 4
 """Most time steps in a row at which effects are evaluated."""
 MOVED = 0.15
-"""Of θ's z: how far it may move before the steps are linearized anew."""
+"""How far θ's z and parameters of effects on the model may move before the steps are linearized anew."""
 
 
 @dataclass
@@ -43,6 +44,8 @@ class _Around:
 
     z: Float[np.ndarray, " d"]
     """Where θ was."""
+    p: Float[np.ndarray, " k"]
+    """Where θ and the parameters of effects on the model were."""
     motion: Motion
     lin: Linearized
     windowed: Windowed
@@ -84,8 +87,16 @@ class Scene:
         self.fine = next(s for s in range(min(FINE, rows), 0, -1) if rows % s == 0)
         self.h = system.dt / self.fine
         self.times = motion.start[:, None] + self.h * jnp.arange(motion.ctrl.shape[1] * self.fine)
-        self._around: _Around | None = None
+        self._around: dict[bool, tuple[tuple[tuple[int, int], ...], _Around]] = {}
+        self._home: tuple[bytes, _Around] | None = None
         self._kept: dict[Any, Any] = {}
+
+    def twin(self) -> Scene:
+        """The same scene for another thread: what is kept from fit to fit is its own, compiled programs are shared."""
+        assert self.numbers is not None
+        twin = copy.copy(self)
+        twin._around, twin._home, twin._kept = {}, None, {}
+        return twin
 
     @property
     def d(self) -> int:
@@ -118,17 +129,30 @@ class Scene:
     ) -> tuple[Curvature, Float[Array, "windows rows obs"], Float[Array, "windows kn rowsobs"]]:
         """Normal equations at a point, residuals over σ, and derivatives of what is predicted over σ."""
         motion, readings = self._restored(candidate, p)
-        ports = {self.pairs[k][0].port for k in candidate.effects}
-        around = self._linearized(candidate, p, motion, fresh=bool(ports & {"model", "sense"}))
+        around = self._linearized(candidate, p, motion)
         pushes = [push for k, place in self.offsets(candidate) for push in self._pushes(k, p, place, around)]
         sensed = []
         if readings:
             raw = self._windowed(p, self.motion).seen
             sensed = [(channel, raw[..., channel], *rest) for channel, *rest in readings]
         forcing = _assemble(around.windowed.seen, pushes, sensed, self.model.nv, p.size)
-        moved = np.zeros_like(p)
-        moved[: self.d] = p[: self.d] - around.z
+        moved = np.where(self._steps(candidate), p - around.p, 0.0)
         return assess(around.lin, around.windowed, forcing, moved, p, delta, sigma)
+
+    def begin_around(self, p: Float[Array, " k"]) -> None:
+        """Linearize around the θ of a point; what a fit finds then does not depend on the fits before it."""
+        key = np.asarray(p)[: self.d].tobytes()
+        if self._home is None or self._home[0] != key:
+            self._around = {}
+            self._home = key, self._linearized(Candidate(), np.asarray(p), self.motion)
+        self._around = {False: ((), self._home[1])}
+
+    def _steps(self, candidate: Candidate) -> Bool[np.ndarray, " k"]:
+        """What of p changes the steps themselves: θ, and parameters of effects on the model."""
+        found = np.arange(self.d + self.slots) < self.d
+        for k, place in self.offsets(candidate):
+            found[place] = k in self.edits
+        return found
 
     @cached_property
     def numbers(self) -> Any:
@@ -173,17 +197,23 @@ class Scene:
         parts = (p[: self.d], x, on, *(np.asarray(v, float) for v in (low, high, neutral)))
         return np.concatenate(parts), along
 
-    def _linearized(self, candidate: Candidate, p: np.ndarray, motion: Motion, fresh: bool) -> _Around:
-        """Steps around the motion: those of before, where neither the model nor the motion nor θ has changed much."""
-        if not fresh and self._around is not None:
-            change = np.abs(p[: self.d] - self._around.z)
-            if change.max(initial=0.0) < MOVED:
-                return self._around
+    def _linearized(self, candidate: Candidate, p: np.ndarray, motion: Motion) -> _Around:
+        """Steps around the motion: those of before, where neither the motion nor the model has changed much.
+
+        Kept are the last ones without effects on the model, and the last ones with some.
+        """
+        edits = tuple((k, place.start) for k, place in self.offsets(candidate) if k in self.edits)
+        steps = self._steps(candidate)
+        if bool(edits) in self._around:
+            last, kept = self._around[bool(edits)]
+            same = last == edits and motion is kept.motion
+            if same and np.abs(p - kept.p)[steps].max(initial=0.0) < MOVED:
+                return kept
         full, along = self._full(candidate, p)
         lin = linearize_steps(self.engine, self.numbers, motion, full, along, self.system.substeps, self.step)
-        around = _Around(p[: self.d], motion, lin, self._windowed(p, motion))
-        if not fresh:
-            self._around = around
+        around = _Around(p[: self.d], np.where(steps, p, 0.0), motion, lin, self._windowed(p, motion))
+        if motion is self.motion:
+            self._around[bool(edits)] = edits, around
         return around
 
     def _windowed(self, p: np.ndarray, motion: Motion) -> Windowed:

@@ -78,8 +78,13 @@ class Screen:
         self.floor = noise_floor(scene.shots)
         self.counts = np.maximum(np.asarray(scene.shots.measured).sum((0, 1)), 1)
 
-    def starts(self, candidate: Candidate, random: np.random.Generator) -> list[np.ndarray]:
+    def twin(self) -> Screen:
+        """The same screen for another thread."""
+        return Screen(self.scene.twin())
+
+    def starts(self, candidate: Candidate) -> list[np.ndarray]:
         """Points of a candidate's x to begin from: its start values, mirrored where a sign is open, and draws."""
+        random = np.random.default_rng(candidate.effects)
         parameters, margin = self.scene.parameters, self.scene.margin
         each = [(p, m) for k in candidate.effects for p, m in zip(parameters[k], margin[k], strict=True)]
         begin = np.array([float(m.standard(jnp.asarray(p.start, float))) for p, m in each])
@@ -171,10 +176,11 @@ class Screen:
             raise ValueError("the simulator diverges along the recorded motion.")
         return found
 
-    def begin_candidate(self, candidate: Candidate, known: Screened, random: np.random.Generator) -> Begun | None:
+    def begin_candidate(self, candidate: Candidate, known: Screened) -> Begun | None:
         """Fit a candidate from several points beside a fit without it; `known` may hold some of its effects already."""
+        self.scene.begin_around(known.p)
         added = Candidate(tuple(k for k in candidate.effects if k not in known.candidate.effects))
-        points = [self._put(added, known, start) for start in self.starts(added, random)]
+        points = [self._put(added, known, start) for start in self.starts(added)]
         strayed = (np.arange(self.d + self.slots) < self.d) & (np.abs(known.p) > STRAYED)
         if strayed.any():
             points += [np.where(strayed, 0.0, point) for point in points]
@@ -193,6 +199,7 @@ class Screen:
 
     def finish_candidate(self, begun: Begun, known: Screened) -> Screened | None:
         """Fit what was begun to the end, with its own noise, and score it."""
+        self.scene.begin_around(known.p)
         ends = [self.fit(begun.candidate, end[0], end[1], known.sigma, LASTING) for end in begun.ends]
         ends = [end for end in ends if end[2] is not None]
         if not ends:
@@ -224,6 +231,7 @@ class Screen:
 
         What is added begins nearly neutral, as usual, or as it was fitted `alone`.
         """
+        self.scene.begin_around(known.p)
         added = Candidate(tuple(k for k in candidate.effects if k not in known.candidate.effects))
         each = [q for k in added.effects for q in zip(self.scene.parameters[k], self.scene.margin[k], strict=True)]
         starts = [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -273,10 +274,12 @@ def diagnose_case(
     if not is_mismatch(taken.whole, none, thresholds):
         result = Diagnosis("no_mismatch", plain, none, [])
     else:
-        result = name_effects(key, taken.problem, none, thresholds=thresholds, say=say)
-        if result.verdict != "no_mismatch":
+        with ThreadPoolExecutor(1) as pool:
+            # beside the search for a name, of which it needs nothing
+            fitting = pool.submit(_fit_residual_force, key, taken, none)
+            result = name_effects(key, taken.problem, none, thresholds=thresholds, say=say)
             say("fitting a residual force without a name")
-            residual = _fit_residual_force(key, taken, none)
+            residual = fitting.result()
     bench, shots = result.bench, model.shots(windows)
     scale = channel_scale(shots)
     entries = {"baseline": result.baseline, "augmented": result.best}

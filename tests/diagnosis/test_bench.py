@@ -103,8 +103,7 @@ def test_the_concealed_effect_lowers_the_cost_most(problem):
 def test_the_concealed_effect_comes_out_first_along_the_motion(problem):
     screen = problem.screen(problem.pairs)
     nothing = screen.begin(jnp.array([0.0]), jnp.array([0.02, 0.2]))
-    random = np.random.default_rng(0)
-    begun = [screen.begin_candidate(Candidate((k,)), nothing, random) for k in range(len(problem.pairs))]
+    begun = [screen.begin_candidate(Candidate((k,)), nothing) for k in range(len(problem.pairs))]
     found = [screen.finish_candidate(item, nothing) for item in begun]
     assert int(np.argmax([item.likelihood for item in begun])) in (0, 1)
     scores = [item.score - nothing.score for item in found]
@@ -120,9 +119,7 @@ def test_the_concealed_effect_comes_out_first_along_the_motion(problem):
 def test_fits_begin_all_over_parameters_with_many_maxima(problem):
     names = ("torque_ripple", "disturbance_event", "viscous_friction")
     screen = problem.screen([(EFFECTS[name], "joint/hinge") for name in names])
-    ripple, event, viscous = (
-        np.array(screen.starts(Candidate((k,)), np.random.default_rng(0))) for k in range(len(names))
-    )
+    ripple, event, viscous = (np.array(screen.starts(Candidate((k,)))) for k in range(len(names)))
     parameters = {p.name: k for k, p in enumerate(screen.scene.parameters[0])}
     assert len(np.unique(ripple[:, parameters["cycles"]].round(9))) >= 20
     begin, end = (screen.scene.margin[1][k].value(event[:10, k]) for k in (0, 1))
