@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 from bayessim_jax.recordings.loading import load_case
 from bayessim_jax.recordings.recording import resample
@@ -141,7 +142,7 @@ def test_no_window_where_rows_are_farther_apart_than_the_horizon(tmp_path):
     assert any("looks like milliseconds" in f.what for f in case.findings)
 
 
-def test_resampling_interpolates_and_keeps_the_impulse(tmp_path):
+def test_resampling_moves_measurements_and_keeps_the_impulse(tmp_path):
     data = columns()
     data["time"][200:] += 1.0
     data[QPOS][10] = np.nan
@@ -155,11 +156,32 @@ def test_resampling_interpolates_and_keeps_the_impulse(tmp_path):
     end = uniform.time[rows[1]]
     original = (recording.ctrl[:199, 0] * np.diff(np.minimum(recording.time[:200], end))).sum()
     assert held == pytest.approx(original, rel=1e-9)
-    seen = recording.time[:200]
-    np.testing.assert_allclose(
-        uniform.qpos[:79, 0], np.interp(uniform.time[:79], seen, recording.qpos[:200, 0]), atol=1e-12
-    )
+    smooth = CubicSpline(np.delete(recording.time[:200], 10), np.delete(recording.qpos[:200, 0], 10))
+    measured = uniform.qpos_measured[:79, 0]
+    np.testing.assert_allclose(uniform.qpos[:79, 0][measured], smooth(uniform.time[:79])[measured], atol=1e-5)
     assert np.flatnonzero(~uniform.qpos_measured[:, 0]).tolist() == [4]
+
+
+def test_noise_of_jittered_recordings_stays_white_on_a_grid(tmp_path):
+    rng, dt = np.random.default_rng(0), 0.01
+    data = columns(4000, dt)
+    data["time"] = data["time"] + 0.3 * dt * rng.uniform(-0.5, 0.5, 4000)
+    noise = 0.01 * rng.standard_normal(4000)
+    data[QPOS] = np.sin(3.0 * data["time"]) + noise
+    (recording,) = load_case(write_case(tmp_path, run1=data)).recordings
+    uniform = resample(recording, dt)
+    left = uniform.qpos[:, 0] - np.sin(3.0 * uniform.time)
+    left = left[uniform.qpos_measured[:, 0]]
+    assert len(left) > 3900
+    assert left.std() == pytest.approx(0.01, rel=0.04)
+    assert abs(np.corrcoef(left[1:], left[:-1])[0, 1]) < 0.05
+
+
+def test_a_measurement_counts_once_where_the_grid_is_finer(tmp_path):
+    (recording,) = load_case(write_case(tmp_path, run1=columns())).recordings
+    finer = resample(recording, 0.004)
+    assert finer.qpos_measured[:, 0].sum() == pytest.approx(len(recording.time), abs=1)
+    assert (finer.known <= finer.qpos_measured[:, 0]).all()
 
 
 def test_resampling_to_its_own_rows_changes_nothing(tmp_path):
