@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from bayessim_jax.beliefs.margins import Margin, Margins, log_uniform, uniform
 from bayessim_jax.effects import EffectParameter, Scales, at, with_effects
+from bayessim_jax.effects.places import find_site
 from bayessim_jax.inference.replay import Inputs, replay_window
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Fit, Shots, solve
 from bayessim_jax.systems.mjcf import MjcfSystem
@@ -107,6 +108,16 @@ class Bench:
     def names(self, candidate: Candidate) -> list[str]:
         """Of every effect of a candidate."""
         return [self.name(k) for k in candidate.effects]
+
+    def seats(self, candidate: Candidate) -> dict[str, str]:
+        """Names of a candidate's effects on actuators, and the same at the joint that is driven."""
+        model, found = self.union.engine.model, {}
+        for k in candidate.effects:
+            effect, place = self.pairs[k]
+            joint = find_site(model, place).joint
+            if place.startswith("actuator/") and joint >= 0:
+                found[self.name(k)] = f"{effect.name}@joint/{model.joint(joint).name}"
+        return found
 
     def columns(self, candidate: Candidate) -> list[int]:
         """Numbers of a candidate's parameters among those of all effects."""

@@ -337,4 +337,4 @@ def _enter(work: _Work, candidate: Candidate, fit: Fit, known: Float[np.ndarray,
     scores = np.nan_to_num(np.asarray(scores), nan=-1e12)
     misfit_key = jax.random.fold_in(work.key, sum(2**k for k in candidate.effects) % (2**31))
     misfit = judge_misfit(misfit_key, np.asarray(fit.misses), fit.along_states, np.asarray(measured), known)
-    return Entry(candidate, bench.names(candidate), fit, scores, misfit)
+    return Entry(candidate, bench.names(candidate), fit, scores, misfit, seats=bench.seats(candidate))

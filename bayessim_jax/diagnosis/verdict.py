@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,6 +22,8 @@ CONTAINS = {
     "gain_drop": ("actuator_gain",),
     "gain_drift": ("actuator_gain",),
     "payload": ("link_offset",),
+    "joint_flexibility": ("armature",),
+    "backlash": ("armature",),
 }
 """Effects that have others as special cases: where both do as well, the simpler one is the finding."""
 MIMICRY = 0.05
@@ -40,6 +42,8 @@ class Thresholds:
     """Share of the baseline's misfit that an explanation may leave."""
     ahead: float = 0.5
     """Share of the baseline's error of predictions ahead that an explanation of the misfit may leave."""
+    foreseen: float = 0.01
+    """Share of the baseline's error of predictions ahead, below which what pieces leave is the sensors' own."""
     enough: float = 0.015
     """Share that a single effect may leave before pairs are tried."""
     worth: float = 0.4
@@ -64,6 +68,8 @@ class Entry:
     misfit: Misfit
     ahead: float = float("nan")
     """Share of the baseline's error that predictions as long as the horizon still have beyond the noise, if known."""
+    seats: Mapping[str, str] = field(default_factory=dict)
+    """Names of effects on actuators, and the same at the joint that is driven."""
 
     @property
     def score(self) -> float:
@@ -163,7 +169,7 @@ def explains(entry: Entry, none: Entry, thresholds: Thresholds) -> bool:
 
     What explains pieces and predicts hardly better than without it has found a small thing beside a larger one.
     """
-    if entry.misfit.p_value >= FALSE_ALARMS or entry.ahead <= thresholds.left:
+    if entry.misfit.p_value >= FALSE_ALARMS or entry.ahead <= thresholds.foreseen:
         return True
     return share_left(entry.misfit, none.misfit) <= thresholds.left and not entry.ahead > thresholds.ahead
 
@@ -210,7 +216,9 @@ def _contains(one: str, other: str) -> bool:
 
 def _has_special_case(entry: Entry, other: Entry) -> bool:
     """Whether another candidate is this one with one effect replaced by a special case of it."""
-    mine, theirs = set(entry.names) - set(other.names), set(other.names) - set(entry.names)
+    mine, theirs = (
+        {e.seats.get(name, name) for name in set(e.names) - set(o.names)} for e, o in ((entry, other), (other, entry))
+    )
     return len(mine) == len(theirs) == 1 and _contains(mine.pop(), theirs.pop())
 
 
