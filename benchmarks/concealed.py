@@ -223,8 +223,14 @@ def diagnose_concealed(options: Namespace) -> None:
     print("\n" + summarize(rows))
 
 
+ABSORBED = 1.1
+"""Times the noise that a machine with an effect errs in predictions without it, below which θ makes up for it."""
+INSIDE = 1.645
+"""Standard deviations to each side that a 90 % interval has."""
+
+
 def summarize(rows: list[dict[str, Any]]) -> str:
-    """The scoreboard: one line for each group."""
+    """The scoreboard: a line for each group, then predictions, parameters and seconds."""
     lines = []
     for group in GROUPS:
         members = [row for row in rows if row["case"]["group"] == group]
@@ -239,8 +245,66 @@ def summarize(rows: list[dict[str, Any]]) -> str:
             parts.append(f"with a third {sum(row['third'] for row in members)}")
         if located:
             parts.append(f"joint right {sum(located)} of {len(located)}")
+        parts.append(f"library without abstention: wrong in {sum(_is_wrong(row) for row in members)}")
         lines.append(f"{group:<8} {len(members):>4}: {', '.join(parts)}")
+    absorbed = [
+        row for row in rows if row["outcome"] == "missed" and row["nrmse"]["baseline"] < 1.1 * row["noise_floor"]
+    ]
+    if absorbed:
+        lines.append(f"of those missed, {len(absorbed)} predict within a tenth of the noise without the effect")
+    lines += [*_predictions(rows), *_coverage(rows)]
     seconds = np.array([row["seconds"] for row in rows])
     if len(seconds):
         lines.append(f"seconds per case: median {np.median(seconds):.0f}, longest {seconds.max():.0f}")
     return "\n".join(lines)
+
+
+def _is_wrong(row: dict[str, Any]) -> bool:
+    """Whether what fits best of all names something that is not there."""
+    truth = {_bare(f"{e['effect']}@{e['at']}") for e in row["sealed"]["effects"]}
+    return not {_bare(name) for name in row["closest"]} <= truth
+
+
+def _predictions(rows: list[dict[str, Any]]) -> list[str]:
+    """How much of the way from the refitted baseline to what noise allows is gone on recordings held out."""
+    named = [row for row in rows if row["sealed"]["effects"] and row["effects"]]
+    if not named:
+        return []
+    before, after = (np.array([row["nrmse"][which] for row in named]) for which in ("baseline", "augmented"))
+    floor = np.array([row["noise_floor"] for row in named])
+    closed = (before - after) / np.maximum(before - floor, 1e-12)
+    flexible = np.array([row["nrmse"].get("flexible", np.inf) for row in named])
+    return [
+        f"held-out error, {len(named)} cases with an answer: {np.median(np.clip(closed, -1, 1)):.1%} (median) of the "
+        f"gap from the refitted baseline to the noise is closed; worse than the baseline in {(after > before).sum()}, "
+        f"than a force without a name in {(after > flexible).sum()}"
+    ]
+
+
+def _coverage(rows: list[dict[str, Any]]) -> list[str]:
+    """How often intervals hold the machine's own numbers, where the answer is right."""
+    right = [row for row in rows if row["outcome"] == "named"]
+    inside: dict[str, list[bool]] = {"baseline": [], "augmented": [], "effects": []}
+    errors: dict[str, list[float]] = {"baseline": [], "augmented": []}
+    for row in right:
+        for name, table in row["parameters"].items():
+            truth = row["sealed"]["parameters"].get(name, 0.0)
+            for which in ("baseline", "augmented") if truth else ():
+                off = abs(table[which]["mean"] - truth)
+                inside[which].append(off <= INSIDE * table[which]["sd"])
+                errors[which].append(off / abs(truth))
+        worlds = {_bare(f"{e['effect']}@{e['at']}"): e["parameters"] for e in row["sealed"]["effects"]}
+        for effect in row["effects"]:
+            own = worlds[_bare(f"{effect['effect']}@{effect['at']}")]
+            for name, found in effect["parameters"].items():
+                if name in own:
+                    inside["effects"].append(abs(found["mean"] - own[name]) <= INSIDE * found["sd"])
+    if not inside["augmented"]:
+        return []
+    return [
+        f"90 % intervals hold the machine's own parameters in {np.mean(inside['augmented']):.0%} of "
+        f"{len(inside['augmented'])} with the effect, {np.mean(inside['baseline']):.0%} without; median error "
+        f"{np.median(errors['augmented']):.2%} against {np.median(errors['baseline']):.2%}",
+        f"those of effects hold the world's in {np.mean(inside['effects']):.0%} of {len(inside['effects'])}; "
+        "its laws differ in form from the library's",
+    ]
