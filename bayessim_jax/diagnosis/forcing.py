@@ -59,12 +59,13 @@ def force_of(
     time: Float[Array, "windows steps"],
     joint: Joint,
     other: Joint | None,
-    earlier: tuple[Float[Array, "windows before"], Float[Array, "windows before"]] | None = None,
+    earlier: tuple[Float[Array, "windows before"], ...] | None = None,
     period: float = 0.0,
 ) -> tuple[Float[Array, "windows rows"], Float[Array, "windows rows k"]]:
     """Mean force of a `ForceEffect` in every row of so many time steps, and its derivatives along x.
 
-    `earlier` are positions and velocities before the windows, every `period` s, for one that remembers them.
+    `earlier` are positions, velocities and what actuators exerted before the windows, every `period` s, for one that
+    remembers them.
     """
 
     def force(x: Array) -> Array:

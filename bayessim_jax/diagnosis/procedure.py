@@ -170,7 +170,7 @@ def name_effects(
     entries = _finish(work, none, singles, problem.ahead)
     left = share_left(entries[0].misfit, none.misfit) if entries else 1.0
     explained = bool(entries) and explains(entries[0], none, thresholds)
-    if left > thresholds.enough or not explained:
+    if left > thresholds.enough or not explained or entries[0].ahead > thresholds.doubtful:
         say("one effect is not enough: trying pairs")
         before = screen.misfit(key, nothing)
         remain = lambda found: share_left(screen.misfit(key, found), before)  # noqa: E731
@@ -296,7 +296,6 @@ def _without(work: _Work, problem: Problem, detected: Entry) -> Entry:
 def _finish(work: _Work, none: Entry, candidates: Sequence[Screened], ahead: Shots | None) -> list[Entry]:
     """Candidates simulated and fitted from where the screen found them, and scored across recordings, best first."""
     bench = work.bench
-    base = None if ahead is None else bench.replay(Candidate(), none.fit.z, ahead)
 
     def finish(found: Screened) -> Entry | None:
         own = Candidate(tuple(work.numbers.index(k) for k in found.candidate.effects))
@@ -305,8 +304,6 @@ def _finish(work: _Work, none: Entry, candidates: Sequence[Screened], ahead: Sho
         if not np.isfinite(float(fit.cost)):
             return None
         entry = _enter(work, own, work.settle(own, fit))
-        if ahead is not None and base is not None:
-            entry.ahead = error_left(ahead, bench.replay(own, entry.fit.z, ahead), base, entry.misfit.noise)
         entry.scores = np.logaddexp(np.log1p(-DOUBT) + entry.scores, np.log(DOUBT) + none.scores)
         return entry
 
@@ -317,7 +314,25 @@ def _finish(work: _Work, none: Entry, candidates: Sequence[Screened], ahead: Sho
             if entry is not None:
                 entries.append(entry)
                 work.say(f"{' + '.join(entry.names)}: score {entry.score:.1f}")
-    return sorted(entries, key=lambda entry: -entry.score)
+    entries.sort(key=lambda entry: -entry.score)
+    if ahead is not None and entries:
+        _look_ahead(bench, none, entries, ahead)
+    return entries
+
+
+def _look_ahead(bench: Bench, none: Entry, entries: Sequence[Entry], ahead: Shots) -> None:
+    """How far every candidate predicts long windows better than the simulator without effects.
+
+    Initial states are off by what the best candidate's fit moved them.
+    """
+    base, best = bench.replay(Candidate(), none.fit.z, ahead), entries[0]
+    predicted = [bench.replay(entry.candidate, entry.fit.z, ahead) for entry in entries]
+    spread = np.zeros_like(base)
+    for move in np.diag(1.4826 * np.median(np.abs(best.fit.delta), axis=0)):
+        moved = bench.replay(best.candidate, best.fit.z, ahead, jnp.asarray(move))
+        spread = spread + np.nan_to_num((moved - predicted[0]) ** 2)
+    for entry, here in zip(entries, predicted, strict=True):
+        entry.ahead = error_left(ahead, here, base, entry.misfit.noise, spread)
 
 
 def _folds(group: Int[np.ndarray, " windows"]) -> Bool[Array, "folds windows"]:

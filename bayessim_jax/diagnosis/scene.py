@@ -23,7 +23,7 @@ from bayessim_jax.diagnosis.bench import SLOTS, Candidate, margin_of_effect
 from bayessim_jax.diagnosis.forcing import Joint, commands_of, force_of, restore_readings
 from bayessim_jax.diagnosis.response import Forcing, Linearized, Motion, Windowed, assess, linearize_steps
 from bayessim_jax.effects import Scales, at, with_effects
-from bayessim_jax.effects.drive import CAUTION, actuator_torque, actuators_of, read_numbers
+from bayessim_jax.effects.drive import CAUTION, actuator_torque, actuators_of, drives_on, read_numbers
 from bayessim_jax.effects.history import split_history
 from bayessim_jax.effects.places import find_site
 from bayessim_jax.effects.wiring import edit_model
@@ -257,10 +257,7 @@ class Scene:
         kinds, x, (low, high) = self.kinds[e], p[place], self.ranges[e]
         if effect.port == "force":
             other = self._joint(site.other, around, ()) if site.other >= 0 else None
-            earlier = None
-            if effect.recalls and self.motion.earlier is not None:
-                places = int(self.model.jnt_qposadr[site.joint]), self._dof(site.joint)
-                earlier = tuple(rows[..., k] for rows, k in zip(self.motion.earlier, places, strict=True))
+            earlier = self._earlier(site.joint, around) if effect.recalls else None
             seen = (self.h, self.fine, x, low, high, self.times, joint, other, earlier, self.system.dt)
             f, along = force_of(effect, kinds, site.detail, *seen)
             return [(self._dof(site.joint), f, along, place.start)]
@@ -276,6 +273,19 @@ class Scene:
 
     def _dof(self, joint: int) -> int:
         return int(self.model.jnt_dofadr[joint])
+
+    def _earlier(self, joint: int, around: _Around) -> tuple[Array, ...] | None:
+        """Positions and velocities of a joint before the windows, and what actuators exerted on it."""
+        if self.motion.earlier is None:
+            return None
+        key = ("earlier", joint)
+        if key not in around.kept:
+            position, velocity = self.motion.earlier
+            position, velocity = position[..., int(self.model.jnt_qposadr[joint])], velocity[..., self._dof(joint)]
+            numbers = read_numbers(self.model, self.system.engine.writes, self.margins.theta(jnp.asarray(around.z)))
+            drive = drives_on(self.model, numbers, joint, self.motion.past, position, velocity)
+            around.kept[key] = position, velocity, drive
+        return around.kept[key]
 
     def _gains(self, actuators: Sequence[int], around: _Around) -> Float[np.ndarray, " act"]:
         """Forces on their joints for commands of one."""

@@ -27,6 +27,8 @@ __all__ = ["Begun", "Screen", "Screened"]
 
 ITERATIONS, AGAIN = 6, 3
 """Steps of the solver with the noise of before, and then with its own."""
+INERTIAS, BAD = ("kg", "kg m²"), 1.5
+"""Units of parameters for which θ gives way first, where an effect begins at so many times the cost without it."""
 RACES = ((3, False, 4), (4, True, 2), (6, True, 2))
 """Steps of the solver from the points that a candidate is begun from, whether parameters that are scanned move, and how
 many points go on; one race after the other."""
@@ -64,6 +66,8 @@ class Screened:
     """[θ's z, the candidate's x, zeros in the places that are not used]."""
     delta: Float[Array, "windows n"]
     sigma: Float[Array, " obs"]
+    cost: float
+    """At the noise with which it was fitted last, which is nearly its own."""
     score: float
     """Log likelihood at its own noise, less one for every parameter (Akaike 1974), up to a constant."""
 
@@ -118,11 +122,14 @@ class Screen:
         sigma: Array,
         iterations: int = ITERATIONS,
         scanned: bool = True,
+        bad: float = np.inf,
     ) -> tuple[Any, ...]:
         """Levenberg-Marquardt from a point; parameters that are `scanned` may stay where they are.
 
-        Returns (p, δ, curvature, residuals, slopes).
+        Where the point costs more than `bad`, the first step is θ's alone: a rotor takes from the mass that was fitted
+        without it. Returns (p, δ, curvature, residuals, slopes).
         """
+        system = np.arange(self.d + self.slots) < self.d
         free = np.arange(self.d + self.slots) < self.d + self.scene.count(candidate)
         if not scanned:
             for effect, place in self.offsets(candidate):
@@ -143,7 +150,8 @@ class Screen:
             else:
                 damping *= 10
             if k + 1 < iterations:
-                p, delta = propose(here[2], damping, free, self.shots.spread, *here[:2])
+                moving = system if k == 0 and cost > bad else free
+                p, delta = propose(here[2], damping, moving, self.shots.spread, *here[:2])
                 tried = (np.asarray(p), delta)
         return here if here is not None else (p, delta, None, None, None)
 
@@ -164,7 +172,11 @@ class Screen:
             squares = (np.asarray(r) ** 2).sum((0, 1)) * np.asarray(sigma) ** 2
             level = noise_level(squares, self.counts, self.d + own + delta.size, self.floor, LEAST_SHARE)
             score, sigma = self._profile(r, sigma) - own, level
-        return Screened(candidate, jnp.asarray(p), delta, sigma, score) if np.isfinite(score) else None
+        return (
+            Screened(candidate, jnp.asarray(p), delta, sigma, float(curvature.cost), score)
+            if np.isfinite(score)
+            else None
+        )
 
     def begin(self, z: Float[Array, " d"], sigma: Array) -> Screened:
         """The simulator without effects."""
@@ -185,8 +197,10 @@ class Screen:
         if strayed.any():
             points += [np.where(strayed, 0.0, point) for point in points]
         ends: list[tuple[Any, ...]] = [(p, known.delta) for p in points]
+        weighs = any(p.unit in INERTIAS for k in added.effects for p in self.scene.parameters[k])
+        bad = BAD * known.cost if weighs else np.inf
         for steps, scanned, kept in RACES:
-            tried = [self.fit(candidate, end[0], end[1], known.sigma, steps, scanned) for end in ends]
+            tried = [self.fit(candidate, end[0], end[1], known.sigma, steps, scanned, bad) for end in ends]
             ends = sorted((end for end in tried if end[2] is not None), key=lambda end: float(end[2].cost))[:kept]
         if not ends:
             return None

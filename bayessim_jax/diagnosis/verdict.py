@@ -28,6 +28,8 @@ CONTAINS = {
 """Effects that have others as special cases: where both do as well, the simpler one is the finding."""
 MIMICRY = 0.05
 """Chance that what looks like an effect is something else that is in no library."""
+VISIBLE = 0.5
+"""Error of predictions over what cannot be predicted, from which a share of it says something."""
 BOOTSTRAPS, FEW = 1000, 6
 """Draws of the bootstrap; recordings, below which windows are drawn instead."""
 
@@ -40,12 +42,14 @@ class Thresholds:
     """Power of a misfit over that of the noise, below which it is none."""
     left: float = 0.03
     """Share of the baseline's misfit that an explanation may leave."""
-    ahead: float = 0.5
+    ahead: float = 0.3
     """Share of the baseline's error of predictions ahead that an explanation of the misfit may leave."""
     foreseen: float = 0.01
     """Share of the baseline's error of predictions ahead, below which what pieces leave is the sensors' own."""
     enough: float = 0.015
     """Share that a single effect may leave before pairs are tried."""
+    doubtful: float = 0.1
+    """Share of the error of predictions ahead, above which they are tried, too."""
     worth: float = 0.4
     """Share of what fewer effects leave, below which more effects are worth it."""
     tie: float = 2.0
@@ -111,19 +115,24 @@ def error_left(
     predicted: Float[np.ndarray, "windows rows obs"],
     base: Float[np.ndarray, "windows rows obs"],
     noise: Float[np.ndarray, " obs"],
+    spread: Float[np.ndarray, "windows rows obs"] | float = 0.0,
 ) -> float:
-    """Share of the error of one prediction of windows, beyond the noise, that another one still has.
+    """Share of the error of one prediction of windows that another one still has, beyond what cannot be predicted.
 
-    A window in which it errs more, because motion there is chaotic, counts as not improved.
+    That is the sensors' noise and, by their noise in the initial states, `spread`, a variance. A window in which it
+    errs more, because motion there is chaotic, counts as not improved. NaN where the first errs hardly more than that.
     """
     measured, y = np.asarray(shots.measured), np.asarray(shots.y)
     large = 1e6
-    own, was = (
-        np.where(measured, np.nan_to_num(((y - p) / noise) ** 2, nan=large, posinf=large), 0.0).sum((1, 2))
-        for p in (predicted, base)
-    )
-    white = measured.sum()
-    return float(max(np.minimum(own, was).sum() - white, 0.0) / max(was.sum() - white, 1e-12))
+
+    def total(squares: np.ndarray) -> np.ndarray:
+        finite = np.nan_to_num(squares, nan=large, posinf=large)
+        return np.where(measured, np.minimum(finite, large), 0.0).sum((1, 2))
+
+    own, was = (total(((y - p) / noise) ** 2) for p in (predicted, base))
+    least = np.minimum(total(1.0 + spread / noise**2), was).sum()
+    gap = was.sum() - least
+    return float(max(np.minimum(own, was).sum() - least, 0.0) / gap) if gap > VISIBLE * least else float("nan")
 
 
 def are_kin(one: str, other: str) -> bool:

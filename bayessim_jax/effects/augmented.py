@@ -14,7 +14,14 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from bayessim_jax.contracts import Box, Scalar
 from bayessim_jax.effects.contract import Moment, Number, Numbers
-from bayessim_jax.effects.drive import CAUTION, actuator_torque, actuators_of, probe_inertia, read_numbers
+from bayessim_jax.effects.drive import (
+    CAUTION,
+    actuator_torque,
+    actuators_of,
+    drives_on,
+    probe_inertia,
+    read_numbers,
+)
 from bayessim_jax.effects.history import split_history
 from bayessim_jax.effects.places import Site
 from bayessim_jax.effects.wiring import Wired, edit_model
@@ -142,7 +149,10 @@ class AugmentedMjcf:
             state = self._warm(theta, numbers, state, jnp.asarray(past, kind))
         commands, _ = self._commands(theta, numbers, state, first)
         state = self._begin_joints(theta, numbers, inner, state, commands)
-        return state if motion is None or not len(motion[0]) else self._recall(theta, state, *motion)
+        if motion is None or not len(motion[0]):
+            return state
+        commanded = jnp.broadcast_to(first, (len(motion[0]), first.size)) if past is None else jnp.asarray(past, kind)
+        return self._recall(theta, numbers, state, *motion, commanded)
 
     def restart(self, theta: Float[Array, " d"], observation: Float[Array, " obs"]) -> AugmentedState:
         """The state that shows this observation, as if nothing had been commanded for long.
@@ -372,13 +382,17 @@ class AugmentedMjcf:
             memories[k] = _arrays(w.effect.begin(w.values(theta), moment), state.time)
         return replace(state, memories=tuple(memories))
 
-    def _recall(self, theta: Float[Array, " d"], state: AugmentedState, qpos: Array, qvel: Array) -> AugmentedState:
-        """The memories of effects that remember how their joint has moved."""
-        memories = list(state.memories)
+    def _recall(
+        self, theta: Float[Array, " d"], numbers: Numbers, state: AugmentedState, qpos: Array, qvel: Array, ctrl: Array
+    ) -> AugmentedState:
+        """The memories of effects that remember how their joint has moved, and under which commands."""
+        memories, model = list(state.memories), self.engine.model
         for k, w in self._at("force"):
             if w.effect.recalls:
-                place, dof = int(self.engine.model.jnt_qposadr[w.site.joint]), self._dof(w.site.joint)
-                memories[k] = w.effect.recall(w.values(theta), memories[k], qpos[:, place], qvel[:, dof], self.dt)
+                position = qpos[:, int(model.jnt_qposadr[w.site.joint])]
+                velocity = qvel[:, self._dof(w.site.joint)]
+                drive = drives_on(model, numbers, w.site.joint, ctrl, position, velocity)
+                memories[k] = w.effect.recall(w.values(theta), memories[k], position, velocity, drive, self.dt)
         return replace(state, memories=tuple(memories))
 
     def _push(self, inner: Float[Array, " e"], physics: Any, ctrl: Float[Array, " act"]) -> Float[Array, " nv"]:

@@ -227,19 +227,22 @@ class ForceEffect(Effect, Protocol):
     """Whether it looks at `acceleration` or `stop`, and so must not find its own force in them."""
 
     recalls: bool = False
-    """Whether it remembers motion from long before; otherwise the state that it begins in says enough."""
+    """Whether it remembers what happened long before; otherwise the state that it begins in says enough."""
 
     def begin(self, values: Values, moment: Moment) -> Memory:
         """The memory with which a simulation begins in this state, as if it had lasted."""
         return ()
 
-    def recall(self, values: Values, memory: Memory, positions: Array, velocities: Array, h: float) -> Memory:
-        """The memory after a joint has moved so, in steps of h s."""
+    def recall(
+        self, values: Values, memory: Memory, positions: Array, velocities: Array, drives: Array, h: float
+    ) -> Memory:
+        """The memory after a joint has moved so under what actuators exerted on it, in steps of h s."""
 
-        def once(memory: Memory, now: tuple[Array, Array]) -> tuple[Memory, None]:
-            return self.force(values, memory, Moment(jnp.zeros(()), h, *now))[1], None
+        def once(memory: Memory, now: tuple[Array, Array, Array]) -> tuple[Memory, None]:
+            position, velocity, drive = now
+            return self.force(values, memory, Moment(jnp.zeros(()), h, position, velocity, drive=drive))[1], None
 
-        return jax.lax.scan(once, memory, (positions, velocities))[0]
+        return jax.lax.scan(once, memory, (positions, velocities, drives))[0]
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
         """The force during the time step, N or N m, and the memory for the next one."""

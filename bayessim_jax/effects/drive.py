@@ -20,6 +20,7 @@ __all__ = [
     "CAUTION",
     "actuator_torque",
     "actuators_of",
+    "drives_on",
     "least_share",
     "nominal_inertia",
     "probe_inertia",
@@ -63,6 +64,21 @@ def actuator_torque(
     if model.actuator_forcelimited[actuator]:
         pull = jnp.clip(pull, *(float(x) for x in model.actuator_forcerange[actuator]))
     return gear * pull
+
+
+def drives_on(
+    model: mujoco.MjModel,
+    numbers: Numbers,
+    joint: int,
+    ctrl: Float[Array, "*rows nu"],
+    position: Float[Array, "*rows"],
+    velocity: Float[Array, "*rows"],
+) -> Float[Array, "*rows"]:
+    """What all actuators of a joint exert on it along its motion."""
+    found = jnp.zeros_like(position)
+    for i in actuators_of(model, joint):
+        found = found + actuator_torque(model, numbers, i, ctrl[..., i], position, velocity)
+    return found
 
 
 def actuators_of(model: mujoco.MjModel, joint: int) -> list[int]:

@@ -27,7 +27,6 @@ from bayessim_jax.inference.shooting import Shots, robust_covariance
 from bayessim_jax.recordings.experiments import advise, next_experiment
 from bayessim_jax.recordings.identification import Settled, channel_scale, settle_step, start_spread
 from bayessim_jax.recordings.shots import CaseModel, split_windows, take
-from bayessim_jax.recordings.smoothing import smooth_recordings
 from bayessim_jax.recordings.windows import Windows, cut_windows
 
 __all__ = ["CaseDiagnosis", "diagnose_case"]
@@ -199,7 +198,6 @@ def _take_case(key: Array, model: CaseModel, effects: Sequence[Any], say: Callab
     pairs = tuple((effect, place) for effect in effects for place in effect_places(effect, system))
     joints = [f"joint/{name}" for name, *_ in model.case.layout.single]
     rows = max(round(PIECE / model.system.dt), LEAST)
-    smooth = _smoothed(model)
     pieces = cut_windows(fitted, rows)
     whole = Problem(
         system=system,
@@ -208,7 +206,7 @@ def _take_case(key: Array, model: CaseModel, effects: Sequence[Any], say: Callab
         scales=_scales(model, [*(place for _, place in pairs), *joints]),
         shots=model.shots(fitted),
         group=fitted.recording,
-        motion=_motion(model, pieces, cut_windows(_thin(split_windows(smooth)[0], MOST_FITTED), rows)),
+        motion=_motion(model, pieces, cut_windows(_thin(split_windows(model.smoothed)[0], MOST_FITTED), rows)),
         step=model.step,
     )
     # as many windows as are predicted in the end, so that both are one program
@@ -223,12 +221,6 @@ def _motion(model: CaseModel, windows: Windows, smooth: Windows) -> Motion:
     return Motion(
         jnp.asarray(smooth.qpos), jnp.asarray(smooth.qvel), inputs.ctrl, inputs.past, inputs.time, inputs.motion
     )
-
-
-def _smoothed(model: CaseModel) -> CaseModel:
-    """The same case with smoothed motion."""
-    joints = [(q, v) for _, q, v in model.case.layout.single]
-    return dataclasses.replace(model, recordings=smooth_recordings(model.recordings, joints))
 
 
 def _scales(model: CaseModel, places: Sequence[str]) -> dict[str, Scales]:

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from bayessim_jax.inference.replay import Inputs, Restarted, make_predictor
 from bayessim_jax.inference.shooting import Shots
 from bayessim_jax.recordings.priors import LogNormal, Normal, Prior
 from bayessim_jax.recordings.recording import CaseRecording, resample
+from bayessim_jax.recordings.smoothing import smooth_recordings
 from bayessim_jax.recordings.windows import Windows, stack_windows
 from bayessim_jax.systems.mjcf import MjcfSystem, Unknown, mjcf_system
 
@@ -77,6 +79,12 @@ class CaseModel:
             raise ValueError(f"system {self.case.case.system} is no MuJoCo model; give the model as MJCF.")
         return self.system.engine.model
 
+    @cached_property
+    def smoothed(self) -> CaseModel:
+        """The same case with smoothed motion of hinges and slides."""
+        joints = [(q, v) for _, q, v in self.case.layout.single]
+        return dataclasses.replace(self, recordings=smooth_recordings(self.recordings, joints))
+
     def windows(self, which: Sequence[int], horizon: float | None = None, stride: float | None = None) -> Windows:
         """Windows of some of the recordings; `recording` numbers them among all."""
         windows = stack_windows([self.recordings[i] for i in which], horizon or self.case.case.horizon, stride)
@@ -95,7 +103,7 @@ class CaseModel:
         )
 
     def inputs(self, windows: Windows) -> Inputs:
-        """Initial states and commands."""
+        """Initial states and commands; what came before, for effects that remember it, with smoothed motion."""
         before = math.ceil(self.before / self.system.dt - 1e-9)
         shapes = (windows.ctrl, windows.qpos, windows.qvel)
         past, places, rates = (np.zeros((len(windows), before, x.shape[-1])) for x in shapes)
@@ -103,10 +111,10 @@ class CaseModel:
             recording = self.recordings[windows.recording[w]]
             row = int(np.argmin(np.abs(recording.time - windows.start[w])))
             if before:
-                rows = np.arange(row - before, row)
-                begun, rows = rows >= 0, np.maximum(rows, 0)
-                past[w], places[w] = recording.ctrl[rows], recording.qpos[rows]
-                rates[w] = np.where(begun[:, None], recording.qvel[rows], 0.0)
+                rows, smooth = np.arange(row - before, row), self.smoothed.recordings[windows.recording[w]]
+                early, rows = np.minimum(rows, 0) * self.system.dt, np.maximum(rows, 0)
+                past[w], rates[w] = recording.ctrl[rows], smooth.qvel[rows]
+                places[w] = _coast(self, smooth.qpos[rows], rates[w] * early[:, None])
         place = windows.sensors[:, 0] if isinstance(self.system, Restarted) else windows.qpos[:, 0]
         first = (place, windows.qvel[:, 0], windows.ctrl, past, windows.start)
         return Inputs(*map(jnp.asarray, first), motion=(jnp.asarray(places), jnp.asarray(rates)))
@@ -126,6 +134,14 @@ class CaseModel:
         step = np.concatenate([_motions(self.system.engine.model, r.qpos) for r in self.recordings])
         place = np.maximum(np.abs(step).std(0) + np.abs(step).mean(0), 1e-3) if len(step) else np.ones(nv)
         return np.concatenate([place, np.maximum(qvel.std(0), 1e-2)])
+
+
+def _coast(model: CaseModel, qpos: np.ndarray, moves: np.ndarray) -> np.ndarray:
+    """Positions moved along hinges and slides."""
+    found = qpos.copy()
+    for _, q, v in model.case.layout.single:
+        found[:, q] += moves[:, v]
+    return found
 
 
 def _motions(model: Any, qpos: np.ndarray) -> np.ndarray:

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 
 from bayessim_jax.diagnosis.bench import Candidate
-from bayessim_jax.diagnosis.verdict import Entry, Thresholds, are_kin, decide
+from bayessim_jax.diagnosis.verdict import Entry, Thresholds, are_kin, decide, error_left
 from bayessim_jax.diagnosis.whiteness import Misfit
+from bayessim_jax.inference.shooting import Shots
 
 WINDOWS = 30
 
@@ -67,6 +68,19 @@ def test_what_explains_pieces_and_predicts_no_better_explains_nothing():
     for ahead, wanted in ((0.008, "explained"), (0.02, "unexplained")):
         rough.ahead = ahead
         assert verdict(rough).verdict == wanted
+
+
+def test_what_noise_in_initial_states_costs_ahead_is_no_error_of_a_candidate():
+    rng, shape = np.random.default_rng(0), (40, 50, 2)
+    noise, started = np.array([0.1, 0.2]), rng.normal(size=(40, 1, 1)) * np.linspace(0.0, 1.0, 50)[:, None]
+    y = started + noise * rng.normal(size=shape)
+    shots = Shots(None, y, np.ones(shape, bool), np.ones(2))
+    spread = np.broadcast_to(np.linspace(0.0, 1.0, 50)[:, None] ** 2, shape)
+    base, right = np.full(shape, 3.0), np.zeros(shape)
+    assert error_left(shots, right, base, noise) > 0.03
+    assert error_left(shots, right, base, noise, spread) < 0.01
+    assert error_left(shots, base, base, noise, spread) == pytest.approx(1.0)
+    assert np.isnan(error_left(shots, right, right, noise, spread))
 
 
 def test_a_tie_with_what_does_not_explain_is_no_confusion():

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import scipy.linalg
 
 from bayessim_jax.effects import EFFECTS, Scales, with_effects, write_mjcf
 from bayessim_jax.effects.mjcf_edits import WRITERS
@@ -122,6 +123,29 @@ def test_bristles_bend_before_they_slip():
     assert q[-1] == pytest.approx(-3.0 / 1000.0 * np.log(1.0 - 1.0 / 3.0), rel=0.1)
     _, v = ride([("lugre_friction", RAIL)], values, push(5.0, 600))
     assert v[-1] - v[-101] == pytest.approx((5.0 - 2.0) / MASS, rel=0.01)
+
+
+@pytest.mark.parametrize(("k", "d", "rotor"), [(900.0, 3.0, 1.5), (900.0, 90.0, 1.5), (4e6, 10.0, 1.5)])
+def test_a_rotor_is_recalled_as_it_rang(k, d, rotor):
+    """Against the same equation in steps fifty times as fine; ringing, creeping, and too stiff for its steps."""
+    h, many = 0.005, 50
+    t = h * np.arange(201)
+    position, velocity = 0.1 * np.sin(5.0 * t), 0.5 * np.cos(5.0 * t)
+    drive = 4.0 * np.sign(np.sin(9.0 * t[:-1]))
+    angle, speed = position[0] + drive[0] / k, velocity[0]
+    ahead = scipy.linalg.expm(np.array([[0.0, 1.0], [-k / rotor, -d / rotor]]) * h / many)
+    for i in range(200):
+        for part in range(many):
+            now = t[i] + h * (part + 0.5) / many
+            rest = 0.1 * np.sin(5.0 * now) + (drive[i] + d * 0.5 * np.cos(5.0 * now)) / k
+            angle, speed = np.array([rest, 0.0]) + ahead @ (np.array([angle, speed]) - np.array([rest, 0.0]))
+    values = {"stiffness": k, "damping": d, "rotor_inertia": rotor}
+    recalled = EFFECTS["joint_flexibility"].recall(
+        values, (0.0, 0.0), *map(jnp.asarray, (position[:-1], velocity[:-1], drive)), h
+    )
+    assert float(recalled[0]) == pytest.approx(angle, abs=0.02 * np.ptp(position))
+    bend, wanted = float(recalled[0]) - position[-1], angle - position[-1]
+    assert bend == pytest.approx(wanted, abs=0.15 * abs(wanted) + 1e-4)
 
 
 def test_hysteresis_ends_at_the_force_of_its_last_deflection():

@@ -181,5 +181,41 @@ def test_verdicts_are_judged_by_what_is_sealed():
     assert judge(pair, table("explained", right + tilt))["outcome"] == "named"
     third = judge(pair, table("explained", [*right, *tilt, "armature@joint/a"]))
     assert third["outcome"] == "wrong" and third["third"]
-    row = {"case": {"group": "single"}, "seconds": 3.0, **judge(friction, table("explained", right))}
-    assert "named 1, single best 1, joint right 1 of 1" in summarize([row])
+
+
+def test_the_scoreboard_counts_predictions_and_intervals():
+    sealed = {
+        "effects": [
+            {
+                "effect": "coulomb_friction",
+                "at": "joint/a",
+                "joint": "joint/a",
+                "parameters": {"coulomb": 0.10, "smoothing": 3.0},
+            }
+        ],
+        "parameters": {"mass": 0.5},
+    }
+    found = {"effect": "coulomb_friction", "at": "joint/a", "parameters": {"coulomb": {"mean": 0.11, "sd": 0.01}}}
+    moments = {"baseline": {"mean": 0.6, "sd": 0.01}, "augmented": {"mean": 0.505, "sd": 0.01}}
+    row = {
+        "case": {"group": "single"},
+        "sealed": sealed,
+        "seconds": 3.0,
+        "verdict": "explained",
+        "effects": [found],
+        "confusion_set": [],
+        "closest": ["coulomb_friction@joint/a"],
+        "locations": [{"at": "joint/a"}],
+        "parameters": {"mass": moments},
+        "nrmse": {"baseline": 0.5, "augmented": 0.14, "flexible": 0.2},
+        "noise_floor": 0.1,
+    }
+    board = summarize([row | judge(sealed, row)])
+    assert "named 1, single best 1, joint right 1 of 1, library without abstention: wrong in 0" in board
+    assert "90.0% (median)" in board and "worse than the baseline in 0" in board
+    assert "100% of 1 with the effect, 0% without; median error 1.00% against 20.00%" in board
+    assert "those of effects hold the world's in 100% of 1" in board
+    refused = {**row, "verdict": "unexplained", "effects": [], "closest": ["armature@joint/a"]}
+    assert "refused 1, single best 0, joint right 1 of 1, library without abstention: wrong in 1" in summarize(
+        [refused | judge(sealed, refused)]
+    )
