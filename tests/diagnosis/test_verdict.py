@@ -77,7 +77,7 @@ def test_what_noise_in_initial_states_costs_ahead_is_no_error_of_a_candidate():
     shots = Shots(None, y, np.ones(shape, bool), np.ones(2))
     spread = np.broadcast_to(np.linspace(0.0, 1.0, 50)[:, None] ** 2, shape)
     base, right = np.full(shape, 3.0), np.zeros(shape)
-    assert error_left(shots, right, base, noise) > 0.03
+    assert error_left(shots, right, base, noise) > 0.015
     assert error_left(shots, right, base, noise, spread) < 0.01
     assert error_left(shots, base, base, noise, spread) == pytest.approx(1.0)
     assert np.isnan(error_left(shots, right, right, noise, spread))
