@@ -85,7 +85,9 @@ def make_trial(args: argparse.Namespace) -> Callable[[int], dict[str, Any]]:
         pool=2,
     )
     if args.target == "vehicle":
-        target: Any = SimulatedTarget(SkidSteerVehicle(system), OnVehicle(task), truth)  # type: ignore[arg-type]
+        vehicle: Any = SkidSteerVehicle(system)
+        on_vehicle: Any = OnVehicle(task)
+        target: Any = SimulatedTarget(vehicle, on_vehicle, vehicle.theta(truth))
     else:
         target = SimulatedTarget(system, task, truth)
     record, update = jax.jit(online.record), jax.jit(online.update, compiler_options=online.COMPILER_OPTIONS)

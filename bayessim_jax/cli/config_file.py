@@ -66,6 +66,8 @@ def _check(value: Any, hint: Any, name: str) -> Any:
         if value not in get_args(hint):
             raise UsageError(f"{name}: unknown value {value!r}: {near_miss(str(value), get_args(hint))}")
         return value
+    if hint == float | str:
+        return value if isinstance(value, str) else _check(value, float, name)
     if hint is float and type(value) is int:
         return float(value)
     kind = get_origin(hint) or hint

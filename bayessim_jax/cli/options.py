@@ -8,36 +8,50 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 __all__ = ["DIAGNOSED", "HABITS", "Online", "Settings"]
 
 
 def _pairs(words: list[str]) -> dict[str, float]:
-    pairs = {}
-    for word in words:
-        name, equals, value = word.partition("=")
-        try:
-            pairs[name] = float(value)
-        except ValueError:
-            equals = ""
-        if not (name and equals):
-            raise ValueError(f"{word!r} is not of the form NAME=NUMBER, such as length=0.5")
-    return pairs
+    return {name: _number(name, value, word) for word in words for name, _, value in [word.partition("=")]}
 
 
-Pairs = Annotated[
-    dict[str, float],
-    tyro.constructors.PrimitiveConstructorSpec(
+def _hidden(words: list[str]) -> dict[str, float | str]:
+    return {
+        name: value if name == "terrain" and value else _number(name, value, word)
+        for word in words
+        for name, _, value in [word.partition("=")]
+    }
+
+
+def _number(name: str, value: str, word: str) -> float:
+    try:
+        if name:
+            return float(value)
+    except ValueError:
+        pass
+    raise ValueError(f"{word!r} is not of the form NAME=NUMBER, such as length=0.5")
+
+
+def _table(instance_from_str: Callable[[list[str]], dict[str, Any]], metavar: str) -> Any:
+    return tyro.constructors.PrimitiveConstructorSpec(
         nargs="*",
-        metavar="NAME=NUMBER ...",
-        instance_from_str=_pairs,
+        metavar=metavar,
+        instance_from_str=instance_from_str,
         is_instance=lambda x: isinstance(x, dict),
         str_from_instance=lambda x: [f"{name}={value}" for name, value in x.items()],
-    ),
-]
+    )
+
+
+Pairs = Annotated[dict[str, float], _table(_pairs, "NAME=NUMBER ...")]
+Hidden = Annotated[dict[str, float | str], _table(_hidden, "NAME=NUMBER ...")]
+"""Hidden parameters; a vehicle's `terrain` is a word."""
 Run = Annotated[
     str,
     tyro.constructors.PrimitiveConstructorSpec(
@@ -92,11 +106,13 @@ class Settings:
     controller: Literal["auto", "ppo", "sac", "her", "mppi", "disco"] = "auto"
     """What acts: a policy that is trained, or a planner: mppi plans under the mean of the belief, disco under the
     belief; auto takes what suits the system."""
-    truth: Pairs = field(default_factory=dict)
+    truth: Hidden = field(default_factory=dict)
     """True parameters to hide in the target; those not given are drawn from the prior by the seed, and with --from
-    they are the posterior's mean."""
-    change: Pairs = field(default_factory=dict)
-    """Other true parameters from a round on, such as round=10 length=0.8: what is not named stays as it was."""
+    they are the posterior's mean. The vehicle has more: slip, turning_slip, looseness and lag, or the first three by
+    terrain=yard, asphalt, gravel or ice."""
+    change: Hidden = field(default_factory=dict)
+    """Other true parameters from a round on, such as round=10 length=0.8, or terrain=ice for the vehicle: what is not
+    named stays as it was."""
     forget: float = 0.0
     """Probability that the true parameters change between two rounds; above 0 the belief follows a change."""
     scheme: Literal["online", "offline", "uniform"] = "online"
@@ -145,8 +161,14 @@ class Settings:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be {least} or more.")
         if not self.forget < 1:
             raise ValueError(f"forget is {self.forget}; it is a probability, from 0 to below 1.")
-        if self.change and not (self.change.get("round", 0) >= 2 and self.change["round"] % 1 == 0):
+        for table in (self.truth, self.change):
+            for name, value in table.items():
+                if isinstance(value, str) and name != "terrain":
+                    raise ValueError(f"{name} is {value!r}; it needs a number.")
+        if self.change and not ((when := float(self.change.get("round", 0))) >= 2 and when % 1 == 0):
             raise ValueError("change needs the round from which it holds, 2 or more, such as round=10 length=0.8.")
+        if self.change and float(self.change["round"]) > self.rounds:
+            raise ValueError(f"change holds from round {self.change['round']:g}, but rounds is {self.rounds}.")
         if self.seed + self.seeds > 2**32:
             raise ValueError(f"seed is {self.seed}; it must be below {2**32 - self.seeds + 1}.")
         for name, (low, high) in self.prior.items():

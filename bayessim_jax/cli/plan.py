@@ -19,7 +19,7 @@ from bayessim_jax.cli.options import Settings
 from bayessim_jax.cli.parsing import UsageError
 from bayessim_jax.cli.subject import find_subject
 from bayessim_jax.contracts import Box
-from bayessim_jax.effects.vehicle import OnVehicle, SkidSteerVehicle
+from bayessim_jax.effects.vehicle import TERRAINS, OnVehicle, SkidSteerVehicle
 from bayessim_jax.engines.gymnasium import GYMNASIUM, gymnasium_target
 from bayessim_jax.engines.rescored import Rescored
 from bayessim_jax.engines.simulated import SimulatedTarget
@@ -27,7 +27,7 @@ from bayessim_jax.inference.encoders import features_of
 from bayessim_jax.inference.estimators import fourier_mixture, recurrent_mixture, summary_mixture
 from bayessim_jax.inference.fit import Schedule
 from bayessim_jax.recordings.truths import Truths
-from bayessim_jax.spelling import near_miss
+from bayessim_jax.spelling import find_named, near_miss
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -46,9 +46,27 @@ class Plan:
     setup: online.Setup
     target: Any
     seeds: list[int]
-    truths: Truths
+    hidden: Truths
+    """What hides in the target: θ*, and after it parameters of its own, where it has some."""
     remarks: tuple[str, ...] = ()
     """What a person should know before it starts."""
+
+    @property
+    def truths(self) -> Truths:
+        """θ*, in the parameters of the system that infers it."""
+        return self.hidden.leading(self.setup.system.parameters.size)
+
+    @property
+    def hidden_names(self) -> tuple[str, ...]:
+        """What the columns of `hidden` are called."""
+        return (self.target if self.settings.target == "vehicle" else self.setup).system.parameters.names
+
+    def apparent(self, rounds: int) -> Float[np.ndarray, "seed round d"] | None:
+        """θ that the vehicle seems to have on its ground in every round; nothing for other targets."""
+        if self.settings.target != "vehicle":
+            return None
+        every = np.stack([self.hidden.at(index) for index in range(1, rounds + 1)], 1)
+        return np.asarray(jax.vmap(jax.vmap(self.target.system.apparent))(every))
 
     @property
     def keys(self) -> jax.Array:
@@ -68,7 +86,7 @@ class Plan:
         What calls the target on the host is apart from what only computes, because programs with callbacks are not
         kept by the persistent compilation cache.
         """
-        setup, thetas = self.setup, jax.numpy.asarray(self.truths.at(1))
+        setup, thetas = self.setup, jax.numpy.asarray(self.hidden.at(1))
         keys = jax.vmap(online.split)(self.keys)
 
         def record(setup: online.Setup, keys: Any, thetas: Any, states: Any) -> Any:
@@ -99,7 +117,7 @@ class Plan:
             updater = build(update, setup, keys.update, states, seen).compile() if True in rounds else None
 
         def advance(states: online.State) -> tuple[online.State, online.RoundInfo]:
-            thetas = jax.numpy.asarray(self.truths.at(int(states.round[0]) + 1))
+            thetas = jax.numpy.asarray(self.hidden.at(int(states.round[0]) + 1))
             if online.infers(setup, int(states.round[0])):
                 assert recorder is not None and updater is not None
                 recordings = recorder.result()(setup, keys.record, thetas, states)
@@ -155,8 +173,10 @@ def _make_plan(settings: Settings) -> Plan:
         **{name: getattr(settings, name) for name in sizes},
     )
     seeds = list(range(settings.seed, settings.seed + settings.seeds))
-    truths = _truths(settings, box, seeds, subject.truth)
-    kind, target = _target(settings, system, task, truths.at(1)[0], rescored=planned)
+    kind = _kind(settings, system)
+    vehicle = SkidSteerVehicle(system) if kind == "vehicle" else None
+    hidden = _hidden(settings, box, seeds, subject.truth, vehicle)
+    target = _target(kind, settings, system, task, vehicle, hidden.at(1)[0], rescored=planned)
     complete = dataclasses.replace(
         settings,
         target=kind,
@@ -166,26 +186,29 @@ def _make_plan(settings: Settings) -> Plan:
         schedule=pace,
         learner={name: value for name, value in habits.items() if value is not None},
     )
-    return Plan(complete, setup, target, seeds, truths, subject.remarks)
+    return Plan(complete, setup, target, seeds, hidden, subject.remarks)
 
 
-def _target(settings: Settings, system: Any, task: Any, truth: Any, *, rescored: bool) -> tuple[Any, Any]:
-    """What the settings' target is called once it is chosen, and the target."""
+def _kind(settings: Settings, system: Any) -> str:
+    """What the settings' target is called once it is chosen."""
     name, kind = settings.system, settings.target
     if kind == "auto":
-        kind = "gymnasium" if name in GYMNASIUM else "simulated"
-    if kind == "simulated":
-        return kind, SimulatedTarget(system, task, truth)
-    if kind == "vehicle":
-        if not isinstance(system, systems.SkidSteer):
-            raise ValueError(f"the target vehicle is a skid-steered one; {name} has none: take another --target.")
-        vehicle: Any = SkidSteerVehicle(system)
-        on_vehicle: Any = OnVehicle(task)
-        return kind, SimulatedTarget(vehicle, on_vehicle, truth)
-    if name not in GYMNASIUM:
+        return "gymnasium" if name in GYMNASIUM else "simulated"
+    if kind == "vehicle" and not isinstance(system, systems.SkidSteer):
+        raise ValueError(f"the target vehicle is a skid-steered one; {name} has none: take another --target.")
+    if kind == "gymnasium" and name not in GYMNASIUM:
         raise ValueError(f"Gymnasium has no environment for {name}; add --target simulated.")
-    target = gymnasium_target(name, truth, system.noise)
-    return kind, Rescored(target, system, task, truth) if rescored else target
+    return kind
+
+
+def _target(kind: str, settings: Settings, system: Any, task: Any, vehicle: Any, hidden: Any, *, rescored: bool) -> Any:
+    if kind == "simulated":
+        return SimulatedTarget(system, task, hidden)
+    if kind == "vehicle":
+        on_vehicle: Any = OnVehicle(task)
+        return SimulatedTarget(vehicle, on_vehicle, hidden)
+    target = gymnasium_target(settings.system, hidden, system.noise)
+    return Rescored(target, system, task, hidden) if rescored else target
 
 
 def _estimator(settings: Settings, system: Any, schedule: Schedule) -> Any:
@@ -207,25 +230,32 @@ def _check_restart(system: Any, controller: str, learner: str) -> None:
         ) from error
 
 
-def _truths(settings: Settings, box: Box, seeds: list[int], usual: Float[np.ndarray, " d"] | None) -> Truths:
-    """The hidden parameters of every seed: those given, the others as usual or drawn from the prior; and what becomes
-    of them.
+def _hidden(
+    settings: Settings,
+    box: Box,
+    seeds: list[int],
+    usual: Float[np.ndarray, " d"] | None,
+    vehicle: SkidSteerVehicle | None,
+) -> Truths:
+    """The hidden parameters of every seed: those given, the others as usual or drawn from the prior; then those of the
+    vehicle's own; and what becomes of them.
     """
-    _check_names(settings.truth, box.names, "truth")
-    changed = {name: value for name, value in settings.change.items() if name != "round"}
-    _check_names(changed, box.names, "change")
-    if settings.change and not changed:
-        raise ValueError("change names no parameter; add one, such as --change round=10 NAME=NUMBER.")
+    every = box if vehicle is None else vehicle.parameters
+    low, high = np.asarray(every.low), np.asarray(every.high)
 
     def placed(drawn: np.ndarray, given: Mapping[str, float], what: str) -> np.ndarray:
-        low, high = np.asarray(box.low), np.asarray(box.high)
-        for i, name in enumerate(box.names):
+        _check_names(given, every.names, what)
+        for i, name in enumerate(every.names):
             if name in given:
                 drawn[:, i] = given[name]
                 if not (low[i] <= drawn[:, i]).all() or not (drawn[:, i] <= high[i]).all():
+                    range_, advice = (
+                        ("the prior", " or widen [prior] in a config file") if i < box.size else ("its range", "")
+                    )
                     raise ValueError(
-                        f"{what} {name}={given[name]} lies outside the prior, {_short(low[i])} to "
-                        f"{_short(high[i])} {box.units[i]}; choose another or widen [prior] in a config file."
+                        f"{what} {name}={given[name]} lies outside {range_}, {_short(low[i])} to {_short(high[i])} "
+                        f"{every.units[i]}".rstrip()
+                        + f"; choose another{advice}."
                     )
         return drawn
 
@@ -233,9 +263,24 @@ def _truths(settings: Settings, box: Box, seeds: list[int], usual: Float[np.ndar
     drawn = np.stack([np.array(box.low + jax.random.uniform(key, (box.size,)) * box.width) for key in keys])
     if usual is not None:
         drawn[:] = np.clip(usual, box.low, box.high)
-    first = placed(drawn, settings.truth, "truth")
-    later = placed(first.copy(), changed, "change")
-    return Truths(first, later, int(settings.change["round"]) if settings.change else None)
+    if vehicle is not None:
+        drawn = np.array(jax.vmap(vehicle.theta)(drawn))
+    changed = _numbers(settings.change, vehicle, "change")
+    change = int(changed.pop("round")) if changed else None
+    if change is not None and not changed:
+        raise ValueError("change names no parameter; add one, such as --change round=10 NAME=NUMBER.")
+    first = placed(drawn, _numbers(settings.truth, vehicle, "truth"), "truth")
+    return Truths(first, placed(first.copy(), changed, "change"), change)
+
+
+def _numbers(given: Mapping[str, float | str], vehicle: SkidSteerVehicle | None, what: str) -> dict[str, float]:
+    """What is given, with the numbers that a terrain's name stands for; numbers beside it win."""
+    numbers = {name: float(value) for name, value in given.items() if name != "terrain"}
+    if "terrain" not in given:
+        return numbers
+    if vehicle is None:
+        raise ValueError(f"{what}: only the vehicle drives on a terrain; add --target vehicle.")
+    return {**find_named(str(given["terrain"]), TERRAINS, f"{what}: unknown terrain"), **numbers}
 
 
 def _check_names(given: Iterable[str], known: Iterable[str], what: str) -> None:

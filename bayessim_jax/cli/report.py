@@ -38,7 +38,7 @@ def report(words: Sequence[str]) -> int:
 def read_run(folder: RunFolder) -> OnlineRun:
     """What a run folder says, as the report wants it; raises `ValueError` where a file is damaged."""
     read, settings = read_draws(folder.path / "posterior.nc"), folder.read_config()
-    drives, scene = _control(folder, settings, read.draws)
+    drives, scene, apparent = _control(folder, settings, read.draws)
     return OnlineRun(
         settings=settings,
         facts=folder.read_run(),
@@ -51,13 +51,16 @@ def read_run(folder: RunFolder) -> OnlineRun:
         truths=read.truths,
         drives=drives,
         scene=scene,
+        apparent=apparent,
     )
 
 
-def _control(folder: RunFolder, settings: dict[str, Any], draws: np.ndarray) -> tuple[Drives | None, Scene | None]:
-    """What a planner did on the target, and the scene of its last recording."""
+def _control(
+    folder: RunFolder, settings: dict[str, Any], draws: np.ndarray
+) -> tuple[Drives | None, Scene | None, np.ndarray | None]:
+    """What a planner did on the target, the scene of its last recording, and θ that a vehicle seems to have."""
     if settings.get("controller") not in ("mppi", "disco"):
-        return None, None
+        return None, None, None
     from bayessim_jax.cli.config_file import settings_from
     from bayessim_jax.cli.options import Settings
     from bayessim_jax.cli.plan import make_plan
@@ -70,7 +73,7 @@ def _control(folder: RunFolder, settings: dict[str, Any], draws: np.ndarray) -> 
     drives = Drives(channels=tuple(system.observations.names), **first)
     before = draws[-2, 0] if len(draws) > 1 else None
     planner: Any = plan.setup.learner
-    return drives, replan(planner, drives, len(draws), before)
+    return drives, replan(planner, drives, len(draws), before), plan.apparent(len(draws))
 
 
 def write_report(folder: RunFolder) -> Path:

@@ -135,11 +135,11 @@ class Session:
 
     def _opening(self, before: dict[str, Any]) -> dict[str, Any]:
         device, plan, now = jax.devices()[0], self.plan, _now()
-        hidden = plan.truths.first
+        hidden = plan.hidden.first
         columns = [hidden[:, i].astype(float).tolist() for i in range(hidden.shape[1])]
         truth = {
             name: column if len(plan.seeds) > 1 else column[0]
-            for name, column in zip(plan.setup.system.parameters.names, columns, strict=True)
+            for name, column in zip(plan.hidden_names, columns, strict=True)
         }
         sources, entries = plan.sources(), read_bibliography()
         return {

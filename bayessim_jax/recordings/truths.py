@@ -24,6 +24,10 @@ class Truths:
         """θ* that never changes."""
         return cls(truths, truths)
 
+    def leading(self, count: int) -> Truths:
+        """The first `count` parameters: those that are inferred of a target that has more."""
+        return Truths(self.first[:, :count], self.later[:, :count], self.change)
+
     def at(self, index: int) -> Float[np.ndarray, "seed d"]:
         """θ* in round `index`, counted from 1."""
         return self.later if self.change is not None and index >= self.change else self.first

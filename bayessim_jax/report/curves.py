@@ -64,14 +64,24 @@ def cost_over_rounds(cost: Float[np.ndarray, "seed round"], change: int | None) 
     def draw(figure: Figure) -> None:
         ax = figure.subplots()
         plot_seeds(ax, cost, BLUE, "on the target")
-        if change is not None:
-            ax.axvline(change - 0.5, color=ORANGE, linestyle=":", linewidth=1.2, label="the target changes")
+        _mark_change(ax, change)
         set_rounds(ax, cost.shape[1])
         ax.set_ylim(bottom=0)
         ax.set_ylabel("mean cost of a step")
         ax.legend(loc="best")
 
     return draw_svg(4.8, 3.0, draw, "cost")
+
+
+def _draw_apparent(ax: Axes, values: Float[np.ndarray, " round"] | None) -> None:
+    if values is not None:
+        x, style = np.arange(1, len(values) + 1), {"color": PURPLE, "linestyle": ":", "linewidth": 1.4}
+        ax.step(x, values, where="mid", label="apparent, with slip", **style)
+
+
+def _mark_change(ax: Axes, change: int | None) -> None:
+    if change is not None:
+        ax.axvline(change - 0.5, color=GREY, linestyle=":", linewidth=1.2, label="the target changes")
 
 
 def log_density_plot(log_prob: Float[np.ndarray, "seed round"], log_prior: float) -> str:
@@ -96,8 +106,13 @@ def estimates_plot(
     low: Float[np.ndarray, " d"],
     high: Float[np.ndarray, " d"],
     truth: Float[np.ndarray, "seed round d"] | None,
+    apparent: Float[np.ndarray, "seed round d"] | None = None,
+    change: int | None = None,
 ) -> str:
-    """Posterior mean with one and two standard deviations for one seed; for several, the mean minus the truth."""
+    """Posterior mean with one and two standard deviations for one seed; for several, the mean minus the truth.
+
+    `apparent` is what the parameters of a target seem to be that the model does not know in full.
+    """
     seeds, rounds, d = mean.shape
     columns = min(d, 2)
     rows = -(-d // columns)
@@ -107,6 +122,7 @@ def estimates_plot(
         if seeds > 1 and truth is not None:
             plot_seeds(ax, mean[:, :, i] - truth[:, :, i], BLUE, "posterior mean − truth")
             ax.axhline(0.0, color=ORANGE, linewidth=1.2, label="truth")
+            _draw_apparent(ax, None if apparent is None else np.median(apparent - truth, axis=0)[:, i])
             ax.set_ylabel(quantity(f"error of {names[i]}", units[i]))
         else:
             if seeds == 1:
@@ -120,9 +136,11 @@ def estimates_plot(
                     ax.step(x, truth[0, :, i], where="mid", color=ORANGE, linewidth=1.2, label="truth")
                 else:
                     ax.axhline(truth[0, 0, i], color=ORANGE, linewidth=1.2, label="truth")
+            _draw_apparent(ax, None if apparent is None else np.median(apparent, axis=0)[:, i])
             for bound, label in ((low[i], "prior's bounds"), (high[i], None)):
                 ax.axhline(bound, color=GREY, linestyle="--", linewidth=0.9, label=label)
             ax.set_ylabel(quantity(names[i], units[i]))
+        _mark_change(ax, change)
         set_rounds(ax, rounds)
 
     def draw(figure: Figure) -> None:

@@ -33,6 +33,8 @@ class OnlineRun:
     drives: Drives | None = None
     """What the target showed, where a planner acted."""
     scene: Scene | None = None
+    apparent: Float[np.ndarray, "seed round d"] | None = None
+    """θ that the target seems to have, where it is a vehicle that slips."""
 
     @property
     def rounds(self) -> int:
@@ -48,6 +50,15 @@ class OnlineRun:
     def inferred(self) -> bool:
         """Whether any round inferred; where none did, the posterior of every round is the prior."""
         return bool(np.isfinite(self.series("log_q_validation")).any())
+
+    @property
+    def change(self) -> tuple[int, str] | None:
+        """The round from which the target is another one, and in what."""
+        told = dict(self.settings.get("change") or {})
+        if not told:
+            return None
+        index = int(told.pop("round"))
+        return index, ", ".join(f"{k} = {v if isinstance(v, str) else f'{v:g}'}" for k, v in told.items())
 
     def series(self, name: str) -> Float[np.ndarray, "seed round"]:
         """One number of the metrics lines; NaN where it is null or absent."""

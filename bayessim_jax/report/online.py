@@ -114,21 +114,27 @@ def _over_rounds(run: OnlineRun) -> list[str]:
     if np.isfinite(target).any() or np.isfinite(simulated).any():
         caption = "Return of an episode: the deterministic policy on the target, and the exploring one in simulation."
         figures.append(html.figure(return_plot(target, simulated), "Return against rounds.", caption))
-    change = (run.settings.get("change") or {}).get("round")
+    changed = run.change[0] if run.change else None
+    becomes = f"; the target changes before round {run.change[0]}: {run.change[1]}." if run.change else "."
     if run.drives:
-        caption = "Mean cost of a step on the target, in an episode after each round"
-        caption += f"; θ* changes before round {int(change)}." if change else "."
-        svg = cost_over_rounds(run.series("cost_target"), int(change) if change else None)
+        caption = f"Mean cost of a step on the target, in an episode after each round{becomes}"
+        svg = cost_over_rounds(run.series("cost_target"), changed)
         figures.append(html.figure(svg, "Cost of a step against rounds.", caption))
     if run.truths is not None:
         log_prior = -float(np.log(run.high - run.low).sum())
         svg = log_density_plot(run.series("log_prob_true"), log_prior)
         caption = "Log density of the truth under the posterior, in raw units of θ; higher is better."
         figures.append(html.figure(svg, "Log-likelihood, log q of the true parameters, against rounds.", caption))
-    shape = (run.names, run.units, run.low, run.high, run.truth_over_rounds())
+    shape = (run.names, run.units, run.low, run.high, run.truth_over_rounds(), run.apparent, changed)
     svg = estimates_plot(run.vectors("mean"), run.vectors("sd"), *shape)
     alt = "Posterior mean of each parameter against rounds."
-    figures.append(html.figure(svg, alt, "What each round concluded.", wide=True))
+    caption = f"What each round concluded{becomes}"
+    if run.apparent is not None:
+        caption += (
+            " Wheels that slip look smaller, and further apart, than they are: dotted is the robot without slip that "
+            "would move as the vehicle does once its wheels turn as asked."
+        )
+    figures.append(html.figure(svg, alt, caption, wide=True))
     return [html.figures(*figures), _rounds_table(run)]
 
 
