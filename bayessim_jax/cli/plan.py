@@ -174,7 +174,8 @@ def _make_plan(settings: Settings) -> Plan:
     )
     seeds = list(range(settings.seed, settings.seed + settings.seeds))
     kind = _kind(settings, system)
-    vehicle = SkidSteerVehicle(system) if kind == "vehicle" else None
+    robot: Any = system
+    vehicle = SkidSteerVehicle(robot) if kind == "vehicle" else None
     hidden = _hidden(settings, box, seeds, subject.truth, vehicle)
     target = _target(kind, settings, system, task, vehicle, hidden.at(1)[0], rescored=planned)
     complete = dataclasses.replace(
@@ -264,7 +265,7 @@ def _hidden(
     if usual is not None:
         drawn[:] = np.clip(usual, box.low, box.high)
     if vehicle is not None:
-        drawn = np.array(jax.vmap(vehicle.theta)(drawn))
+        drawn = np.array(jax.vmap(vehicle.theta)(jax.numpy.asarray(drawn)))
     changed = _numbers(settings.change, vehicle, "change")
     change = int(changed.pop("round")) if changed else None
     if change is not None and not changed:

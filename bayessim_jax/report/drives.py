@@ -105,7 +105,7 @@ def drive_animation(scene: Scene, caption: str) -> str:
     way = np.stack([_joined(scene.poses[np.minimum(np.arange(count), k), :2]) for k in range(count)])
     bodies = [
         ("circle to follow", GREY, 0.8, 1.5, np.repeat(_joined(circle)[None], count, 0)),
-        ("plans weighed", PURPLE, 0.25, 1.0, np.concatenate([_each(p) for p in np.moveaxis(scene.paths, 1, 0)], 1)),
+        ("plans weighed", PURPLE, 0.45, 1.0, np.concatenate([_each(p) for p in np.moveaxis(scene.paths, 1, 0)], 1)),
         ("plan made of them", ORANGE, 0.95, 2.0, _each(scene.best)),
         ("way so far", BLUE, 0.7, 1.5, way),
         ("vehicle", "", 1.0, 2.5, np.stack([_outline(*pose) for pose in scene.poses])),

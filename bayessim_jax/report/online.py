@@ -111,7 +111,8 @@ def _parameter_table(run: OnlineRun) -> str:
 def _over_rounds(run: OnlineRun) -> list[str]:
     figures = []
     target, simulated = run.series("return_target"), run.series("return_simulated")
-    if np.isfinite(target).any() or np.isfinite(simulated).any():
+    returned = np.isfinite(target).any() and not run.drives  # of a planner the cost says the same
+    if returned or np.isfinite(simulated).any():
         caption = "Return of an episode: the deterministic policy on the target, and the exploring one in simulation."
         figures.append(html.figure(return_plot(target, simulated), "Return against rounds.", caption))
     changed = run.change[0] if run.change else None
@@ -120,7 +121,7 @@ def _over_rounds(run: OnlineRun) -> list[str]:
         caption = f"Mean cost of a step on the target, in an episode after each round{becomes}"
         svg = cost_over_rounds(run.series("cost_target"), changed)
         figures.append(html.figure(svg, "Cost of a step against rounds.", caption))
-    if run.truths is not None:
+    if run.truths is not None and run.apparent is None:
         log_prior = -float(np.log(run.high - run.low).sum())
         svg = log_density_plot(run.series("log_prob_true"), log_prior)
         caption = "Log density of the truth under the posterior, in raw units of θ; higher is better."

@@ -71,7 +71,8 @@ def _single(run: OnlineRun) -> str:
         true = ""
         if run.truths is not None:
             decimals = min(max(0, 1 - math.floor(math.log10(sd[i]))), 12) if sd[i] > 0 else 3
-            true = f" (true {run.truths[0, i]:.{decimals}f})".replace("-", "−")
+            seems = "" if run.apparent is None else f", apparent {run.apparent[0, -1, i]:.{decimals}f}"
+            true = f" (true {run.truths[0, i]:.{decimals}f}{seems})".replace("-", "−")
         parts.append(f"{name} is {plus_minus(mean[i], sd[i], unit)}{true}")
     return _join(parts)
 
@@ -82,9 +83,12 @@ def _several(run: OnlineRun) -> str:
         spread = run.vectors("mean")[:, -1]
         pairs = zip(run.names, run.units, spread.mean(0), spread.std(0), strict=True)
         return f"{seeds} " + _join([f"{n} is {plus_minus(m, s, u)} over the seeds" for n, u, m, s in pairs])
-    error = np.median(np.abs(run.vectors("mean")[:, -1] - run.truths), axis=0)
+    aim = run.truths if run.apparent is None else run.apparent[:, -1]
+    error = np.median(np.abs(run.vectors("mean")[:, -1] - aim), axis=0)
     pairs = zip(run.names, run.units, error, strict=True)
     parts = [f"{name} by {number(e, 2)}{' ' + unit if unit else ''}" for name, unit, e in pairs]
+    if run.apparent is not None:
+        return f"{seeds} the posterior mean misses what the vehicle seems to have (median) {_join(parts)}"
     log_prob, gain = run.series("log_prob_true")[:, -1], run.series("gain_over_prior")[:, -1]
     own = ", each with its own truth," if len(np.unique(run.truths, axis=0)) > 1 else ""
     side = "above" if np.mean(gain) >= 0 else "below"

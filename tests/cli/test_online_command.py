@@ -18,7 +18,10 @@ from bayessim_jax import online
 from bayessim_jax.cli.config_file import settings_from
 from bayessim_jax.cli.main import main
 from bayessim_jax.cli.options import Settings
+from bayessim_jax.cli.parsing import UsageError
 from bayessim_jax.cli.plan import make_plan
+from bayessim_jax.cli.resolution import read_command
+from bayessim_jax.effects.vehicle import TERRAINS
 
 TINY = """
 system = "cartpole"
@@ -281,6 +284,13 @@ def test_a_process_that_is_stopped_goes_on_as_if_it_had_not_been(tmp_path, numbe
         ("pendulum --change length=0.5", "change needs the round from which it holds"),
         ("pendulum --change round=3", "change names no parameter"),
         ("pendulum --change round=3 length=4", "change length=4.0 lies outside the prior"),
+        ("pendulum --change round=3 length=0.5 --rounds 2", "change holds from round 3, but rounds is 2"),
+        ("pendulum --change round=3 terrain=ice", "only the vehicle drives on a terrain; add --target vehicle"),
+        ("skid_steer --target vehicle --change round=3 terrain=ise", "unknown terrain 'ise': did you mean 'ice'"),
+        ("skid_steer --target vehicle --change round=3 slip=1", "lies outside its range, 0.0 to 0.9; choose another"),
+        ("skid_steer --target vehicle --truth turn_slip=0.1", "did you mean 'turning_slip'"),
+        ("skid_steer --change round=3 slip=0.1", "unknown parameter 'slip'"),
+        ("skid_steer --change round=3 slip=much", "'slip=much' is not of the form NAME=NUMBER"),
         ("pendulum --forget 1", "forget is 1.0; it is a probability"),
     ],
 )
@@ -300,6 +310,28 @@ def test_planners_take_their_settings_and_targets():
     )
     np.testing.assert_array_equal(skid.truths.at(2)[0, :2], skid.truths.at(3)[0, :2])
     assert make_plan(Settings("pendulum", controller="ppo")).settings.controller == "ppo"
+
+
+def test_the_ground_of_the_vehicle_changes_and_theta_does_not(tmp_path):
+    change = {"round": 3.0, "terrain": "ice", "lag": 0.2}
+    plan = make_plan(Settings("skid_steer", target="vehicle", truth={"terrain": "asphalt"}, change=change, seeds=2))
+    own = [TERRAINS[name] for name in ("asphalt", "ice")]
+    expected = [[*values.values(), lag] for values, lag in zip(own, (0.12, 0.2), strict=True)]
+    for index, values in zip((2, 3), expected, strict=True):
+        np.testing.assert_allclose(plan.hidden.at(index)[:, 3:], [values] * 2, rtol=1e-6)
+    np.testing.assert_array_equal(plan.truths.at(2), plan.truths.at(3))
+    simulated = make_plan(Settings("skid_steer", seeds=2))
+    np.testing.assert_array_equal(plan.truths.at(2), simulated.truths.at(2))
+    assert plan.hidden_names[3:] == ("slip", "turning_slip", "looseness", "lag")
+    radius = plan.apparent(3)[..., 0] / plan.truths.first[:, :1]
+    np.testing.assert_allclose(radius, [[0.98, 0.98, 0.7]] * 2, rtol=1e-5)
+    assert simulated.apparent(3) is None
+    (tmp_path / "c.toml").write_text('target = "vehicle"\nchange = {round = 3, terrain = "ice"}\n')
+    words = ["skid_steer", "--config", str(tmp_path / "c.toml")]
+    assert read_command(words).settings.change == {"round": 3.0, "terrain": "ice"}
+    (tmp_path / "c.toml").write_text('[change]\nround = 3\nlength = "long"\n')
+    with pytest.raises(UsageError, match="length is 'long'; it needs a number"):
+        read_command(["pendulum", "--config", str(tmp_path / "c.toml")])
 
 
 @pytest.mark.parametrize("system", ["skid_steer", pytest.param("pendulum", marks=pytest.mark.slow)])

@@ -1,8 +1,11 @@
 import re
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from bayessim_jax.report.online import render
+from bayessim_jax.report.words import headline
 from tests.browser import CHROMIUM, open_in_chromium
 from tests.report.made_up import made_up
 
@@ -52,6 +55,20 @@ def test_what_to_do_next_follows_from_the_run():
     assert "--resume</code>" in cut
     assert "--simulations 400" in cut
     assert "--seeds 8" not in cut
+
+
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_a_ground_that_changes_is_told_and_the_geometry_that_it_makes_apparent(seeds):
+    run = made_up(rounds=4, seeds=seeds)
+    settings = {**run.settings, "target": "vehicle", "change": {"round": 3.0, "terrain": "ice", "lag": 0.2}}
+    apparent = 0.75 * np.repeat(run.truths[:, None], 4, axis=1)
+    page = render(replace(run, settings=settings, apparent=apparent))
+    assert "the target changes before round 3: terrain = ice, lag = 0.2." in page
+    assert "apparent" in page
+    assert "log q(θ*), raw units of θ" not in page
+    if seeds == 1:
+        assert f"(true {run.truths[0, 0]:.2f}" in headline(run)
+        assert ", apparent " in headline(replace(run, apparent=apparent))
 
 
 @pytest.mark.parametrize("options", [{"known": False}, {"seeds": 9}, {"d": 4}, {"d": 1}], ids=str)
