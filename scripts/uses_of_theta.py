@@ -1,6 +1,7 @@
 """The ways of planning with a belief, at equal numbers of simulated model steps.
 
     python scripts/uses_of_theta.py --systems pendulum cartpole skid_steer --runs 12
+    python scripts/uses_of_theta.py --systems cartpole --horizon 40
 
 Every run hides its own θ*, drawn from the prior, in a simulated target, and drives one episode from the same start
 with each planner. Beliefs: `prior`, the uniform one; `posterior`, two components of a tenth of the prior's width, one
@@ -46,6 +47,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=12)
     parser.add_argument("--budget", type=int, default=512)
     parser.add_argument("--steps", type=int, default=200)
+    parser.add_argument("--horizon", type=int, help="control periods ahead, where not as usual for the system")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="file of JSON lines to append runs to, and to resume from")
     args = parser.parse_args()
@@ -59,6 +61,7 @@ def main() -> None:
 
 def _runs(name: str, belief: str, args: argparse.Namespace) -> list[dict[str, Any]]:
     labels = {"system": name, "belief": belief, "seed": args.seed, "budget": args.budget, "steps": args.steps}
+    labels["horizon"] = args.horizon
     return gather(resume(_trial(name, belief, args), args.runs, args.out, labels), args.runs, f"{name} {belief}")
 
 
@@ -75,8 +78,11 @@ def _trial(name: str, kind: str, args: argparse.Namespace) -> Callable[[int], di
         raise SystemExit(f"{name} has no task that one can plan for.")
     system, task, box = entry.system(), entry.planned(), entry.system().parameters
     points = 2 * (2 * box.size + (box.size < 3))
+    ahead = {} if args.horizon is None else {"horizon": args.horizon}
     ways = {
-        way: default_planner("disco", name, system, task, **settings, samples=max(args.budget // (each or points), 2))
+        way: default_planner(
+            "disco", name, system, task, **settings, **ahead, samples=max(args.budget // (each or points), 2)
+        )
         for way, (settings, each) in WAYS.items()
     }
     ways["informed"] = ways["mean"]

@@ -94,7 +94,8 @@ def _ends(result: CaseInference, name: str) -> np.ndarray:
 def _parameter(index: int, decimals: int) -> Callable[[list[dict[str, Any]], str], str]:
     def show(rows: list[dict[str, Any]], ground: str) -> str:
         means = [row["mean"][index] for row in rows]
-        return f"{means[0]:.{decimals}f} ± {rows[0]['sd'][index]:.{decimals}f} ({np.ptp(means):.{decimals}f})"
+        shown = f"{means[0]:.{decimals}f} ± {rows[0]['sd'][index]:.{decimals}f} ({np.ptp(means):.{decimals}f})"
+        return shown.replace("-", "−")
 
     return show
 
@@ -122,8 +123,8 @@ ROWS: dict[str, Callable[[list[dict[str, Any]], str], str]] = {
     "yaw gain": _gain,
     "error before, at the mean of the prior: mean (x, y, yaw)": _error("error_before"),
     "error after": _error("error_after"),
-    "median error after a second, before": _end("end_before"),
-    "median error after a second, after": _end("end_after"),
+    "median error a second ahead, before": _end("end_before"),
+    "median error a second ahead, after": _end("end_after"),
 }
 
 

@@ -47,6 +47,7 @@ def test_figure_two_runs_and_draws(tmp_path):
         ),
         ("uses_of_theta", ["--systems", "pendulum", "--beliefs", "prior", "--budget", 32, "--steps", 5]),
         ("change_of_truth", ["--before", 1, "--after", 1, "--steps", 20, "--episode", 20]),
+        ("change_of_truth", ["--change", "ice", "--before", 1, "--after", 1, "--steps", 20, "--episode", 20]),
     ],
 )
 def test_experiments_with_planners_run_and_resume(script, words, tmp_path):
@@ -63,8 +64,13 @@ def test_experiments_with_planners_run_and_resume(script, words, tmp_path):
         ("reproduce_table1", ["--kept", "--rows", "cartpole", "pendulum", "acrobot"], "benchmarks"),
         ("calibration", ["--kept", "--proposals", "corrected", "truncated", "paper"], "inference"),
         ("reproduce_table2", [], "control"),
+        ("reproduce_table2", ["--use", "particles", "--particles", 4, "--samples", 128], "control"),
+        ("reproduce_table2", ["--use", "sampled"], "control"),
         ("uses_of_theta", [], "control"),
+        ("uses_of_theta", ["--systems", "cartpole", "--horizon", 40], "control"),
         ("change_of_truth", [], "control"),
+        ("change_of_truth", ["--change", "ice"], "control"),
+        ("warthog", [], "control"),
     ],
 )
 def test_the_tables_of_the_docs_are_printed_from_the_records(script, words, page):
