@@ -68,6 +68,11 @@ def test_experiments_with_planners_run_and_resume(script, words, tmp_path):
         ("reproduce_table2", ["--use", "sampled"], "control"),
         ("uses_of_theta", [], "control"),
         ("uses_of_theta", ["--systems", "cartpole", "--horizon", 40], "control"),
+        (
+            "uses_of_theta",
+            ["--systems", "cartpole", "pendulum", "--beliefs", "posterior", "--budget", 8192],
+            "control",
+        ),
         ("change_of_truth", [], "control"),
         ("change_of_truth", ["--change", "ice"], "control"),
         ("warthog", [], "control"),
