@@ -13,6 +13,7 @@ round start from the same pose as the informed one.
 from __future__ import annotations
 
 import argparse
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,7 +41,7 @@ AHEAD = 20
 
 def main() -> None:
     """Run what is asked for and print a line for each round."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--change", choices=("load", "ice"), default="load")
     parser.add_argument("--runs", type=int, default=8)
     parser.add_argument("--before", type=int, default=3, help="rounds before the change")
@@ -91,13 +92,18 @@ def make_trial(args: argparse.Namespace) -> Callable[[int], dict[str, Any]]:
     learner = planner.init(jax.random.key(0))
     if args.change == "load":
         targets = [SimulatedTarget(system, task, jnp.asarray(theta)) for theta in (ROBOT, WORN)]
-        known = [know(target.theta) for target in targets]
     else:
         vehicle: Any = SkidSteerVehicle(system)
         on_vehicle: Any = OnVehicle(task)
         thetas = [vehicle.theta(jnp.asarray(ROBOT), **TERRAINS[name]) for name in ("asphalt", "ice")]
         targets = [SimulatedTarget(vehicle, on_vehicle, theta) for theta in thetas]
-        known = [know(_best_predicting(planner.policy(know(vehicle.apparent(t.theta))), t)) for t in targets]
+
+    @cache
+    def known(changed: int) -> Any:
+        target: Any = targets[changed]
+        if args.change == "load":
+            return know(target.theta)
+        return know(_best_predicting(planner.policy(know(target.system.apparent(target.theta))), target))
 
     def make(index: int) -> dict[str, Any]:
         key, judge_key = jax.random.split(jax.random.fold_in(jax.random.key(args.seed), index))
@@ -112,7 +118,7 @@ def make_trial(args: argparse.Namespace) -> Callable[[int], dict[str, Any]]:
                 stale = float(judge(at, target, state.learner))
             state, info = update(keys.update, setup, state, record(keys.record, setup, target, state))
             costs.append(judge(at, target, state.learner))
-            informed.append(judge(at, target, known[changed]))
+            informed.append(judge(at, target, known(changed)))
             means.append(info.belief.mean())
         return {"cost": np.array(costs), "informed": np.array(informed), "stale": stale, "means": np.stack(means)}
 
