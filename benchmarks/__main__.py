@@ -61,6 +61,8 @@ def main() -> None:
     concealed.add_argument("--seed", type=int, default=1)
     concealed.add_argument("--out", type=Path, help="file of JSON lines to append cases to, and to resume from")
 
+    concealed.add_argument("--peers", action="store_true", help="name them by sparse regression (PySINDy), too")
+
     thresholds = commands.add_parser("thresholds", help="diagnoses with the whole family of the effect left out")
     thresholds.add_argument(
         "--rigs", nargs="+", choices=_RIGS, help="machines; those of one and two joints if left out"

@@ -221,6 +221,37 @@ def diagnose_concealed(options: Namespace) -> None:
             flush=True,
         )
     print("\n" + summarize(rows))
+    if options.peers:
+        print(_name_sparsely(rows))
+
+
+def _name_sparsely(rows: list[dict[str, Any]]) -> str:
+    """What sparse regression of residual torques names in the same cases, at the θ of the fit without effects."""
+    from benchmarks.peers import require_peers
+
+    require_peers("pysindy")
+    from bayessim_jax.recordings.loading import load_case
+    from bayessim_jax.recordings.shots import case_model
+    from benchmarks.peers.sparse_regression import TERMS, find_terms
+
+    named: dict[str, list[bool]] = {group: [] for group in GROUPS}
+    right = []
+    for row in rows:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "case"
+            make_drawn(path, row["case"])
+            theta = {name: table["baseline"]["mean"] for name, table in row["parameters"].items()}
+            found = find_terms(case_model(load_case(path).check()), theta)
+        named[row["case"]["group"]].append(bool(found))
+        if row["case"]["group"] == "single":
+            (effect,) = row["sealed"]["effects"]
+            term, _, joint = found[0].partition("@") if found else ("", "", "")
+            right.append(effect["effect"] in TERMS.get(term, ()) and effect["joint"] in (None, joint))
+    counts = ", ".join(f"{group} {sum(x)} of {len(x)}" for group, x in named.items() if x)
+    return (
+        f"sparse regression (PySINDy): largest term stands for the single effect in {sum(right)} of {len(right)}; "
+        f"names something in {counts}"
+    )
 
 
 ABSORBED = 1.1

@@ -1,5 +1,7 @@
+import json
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 from bayessim_jax.inference.encoders import transition_features
 from bayessim_jax.learning.fixed import RandomPolicy
 from bayessim_jax.systems import CartPole, Pendulum
+from benchmarks.concealed import judge, summarize
 from benchmarks.data import as_recordings, draw_recordings, stack_rows
 from benchmarks.timing import Parts, Spread
 
@@ -42,3 +45,9 @@ def test_a_spread_is_median_and_range():
 def test_an_unknown_benchmark_is_refused_in_one_line():
     done = subprocess.run([sys.executable, "-m", "benchmarks", "onlin"], capture_output=True, text=True)
     assert done.returncode == 2 and "invalid choice" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_the_scoreboard_of_the_docs_is_printed_from_the_records():
+    root = Path(__file__).parents[2]
+    rows = [json.loads(line) for line in (root / "benchmarks/results/concealed.jsonl").read_text().splitlines()]
+    assert summarize([row | judge(row["sealed"], row) for row in rows]) in (root / "docs/benchmarks.md").read_text()
