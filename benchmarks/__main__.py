@@ -1,4 +1,4 @@
-"""Benchmarks: `python -m benchmarks online | estimator | scaling | engines | fetch | concealed | thresholds | mppi`."""
+"""Benchmarks: `python -m benchmarks NAME`."""
 
 from __future__ import annotations
 
@@ -63,6 +63,14 @@ def main() -> None:
 
     concealed.add_argument("--peers", action="store_true", help="name them by sparse regression (PySINDy), too")
 
+    identification = commands.add_parser("identification", help="posteriors of simulated machines against mujoco.sysid")
+    identification.add_argument(
+        "--rigs", nargs="+", choices=_RIGS, help="machines; five of one to three joints if left out"
+    )
+    identification.add_argument("--cases", type=int, default=50)
+    identification.add_argument("--seed", type=int, default=0)
+    identification.add_argument("--out", type=Path, help="file of JSON lines to append cases to, and to resume from")
+
     thresholds = commands.add_parser("thresholds", help="diagnoses with the whole family of the effect left out")
     thresholds.add_argument(
         "--rigs", nargs="+", choices=_RIGS, help="machines; those of one and two joints if left out"
@@ -84,6 +92,11 @@ def main() -> None:
         from benchmarks.concealed import diagnose_concealed
 
         diagnose_concealed(options)
+        return
+    if options.command == "identification":
+        from benchmarks.identification import identify_clean
+
+        identify_clean(options)
         return
     choose_clock(options.clock)
     if options.command == "online":

@@ -1,4 +1,4 @@
-"""Seconds to compile a whole run of Online BayesSim: in a fresh process, without and with the persistent cache."""
+"""Seconds to compile: a whole run of Online BayesSim in a fresh process, or whatever a piece of code compiles."""
 
 from __future__ import annotations
 
@@ -6,10 +6,68 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from benchmarks.timing import choose_clock, chosen_clock, now
 
-__all__ = ["measure_compilation"]
+__all__ = ["Compilation", "fresh_cache", "measure_compilation", "watch_compilation"]
+
+
+class Compilation:
+    """When JAX was tracing, lowering, compiling, or loading what was compiled before."""
+
+    def __init__(self) -> None:
+        self.spans: list[tuple[float, float]] = []
+
+    def listen(self, event: str, seconds: float, **_: str | int) -> None:
+        """Note an event of `jax.monitoring`, which tells it when it is over."""
+        if event.startswith("/jax/core/compile/"):
+            end = time.perf_counter()
+            self.spans.append((end - seconds, end))
+
+    @property
+    def seconds(self) -> float:
+        """Length of the union of the spans: what is traced within what is traced counts once."""
+        total, reached = 0.0, -float("inf")
+        for begin, end in sorted(self.spans):
+            total += max(end - max(begin, reached), 0.0)
+            reached = max(reached, end)
+        return total
+
+
+@contextmanager
+def watch_compilation() -> Iterator[Compilation]:
+    """Collect what JAX compiles within."""
+    import jax.monitoring
+
+    watched = Compilation()
+    jax.monitoring.register_event_duration_secs_listener(watched.listen)
+    try:
+        yield watched
+    finally:
+        jax.monitoring.unregister_event_duration_listener(watched.listen)
+
+
+@contextmanager
+def fresh_cache() -> Iterator[None]:
+    """Compile within against a persistent cache that is empty at first and gone afterwards."""
+    import jax
+    from jax.experimental.compilation_cache.compilation_cache import reset_cache
+
+    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    before = {name: getattr(jax.config, name) for name in names}
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            for name, value in zip(names, (folder, 0.0), strict=True):
+                jax.config.update(name, value)
+            reset_cache()
+            yield
+        finally:
+            for name, value in before.items():
+                jax.config.update(name, value)
+            reset_cache()
 
 
 def measure_compilation() -> tuple[float, float]:

@@ -1,0 +1,167 @@
+"""Posteriors of simulated machines with nothing concealed in them, against the estimate of `mujoco.sysid`."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+
+from benchmarks.compilation import fresh_cache, watch_compilation
+from benchmarks.concealed import resumed
+from benchmarks.peers import require_peers
+from benchmarks.timing import stopwatch
+
+if TYPE_CHECKING:
+    from argparse import Namespace
+    from collections.abc import Callable
+    from pathlib import Path
+
+__all__ = ["MODELS", "draw_clean", "identify_clean", "ranks", "summarize"]
+
+MODELS = ("pendulum", "slide", "double", "cart", "arm3")
+NOISE = 1.0
+"""Times 1e-3 rad or 2e-4 m on positions, and ten times as much for a second on velocities."""
+
+
+def draw_clean(rigs: list[str], count: int, seed: int) -> list[dict[str, Any]]:
+    """Cases without an effect, the machines in turn; θ* comes from the seed."""
+    same = {"group": "clean", "effects": [], "strength": 0.0, "noise": NOISE}
+    same |= {"velocities": True, "quantize": None, "jitter": 0.0}
+    return [{"rig": rigs[i % len(rigs)], **same, "seed": seed * 100_000 + i} for i in range(count)]
+
+
+def ranks(draws: np.ndarray, truth: np.ndarray) -> tuple[float, np.ndarray]:
+    """Where θ* lies among draws of a posterior, shape (draws, d): the share of them that is nearer to the mean than θ*
+    by Mahalanobis' distance, and for each parameter the share below θ*. A calibrated posterior's are uniform.
+    """
+    off = np.concatenate([draws, truth[None]]) - draws.mean(0)
+    weights = np.linalg.inv(np.atleast_2d(np.cov(draws.T)))
+    distance = np.einsum("ni,ij,nj->n", off, weights, off)
+    return float((distance[:-1] < distance[-1]).mean()), (draws < truth).mean(0)
+
+
+def identify_clean(options: Namespace) -> None:
+    """Infer the cases that are not in the file yet, with both, and print the table of all."""
+    jax.config.update("jax_enable_x64", True)
+    peer: dict[str, Callable[..., Any] | None] = {}
+    compiled: set[str] = set()
+
+    def make(path: Path, case: dict[str, Any]) -> dict[str, Any]:
+        if not peer:
+            peer["identify"] = _find_peer()
+        first = case["rig"] not in compiled
+        compiled.add(case["rig"])
+        return {"first": first, **_infer(path, case, peer["identify"])}
+
+    rows = []
+    with fresh_cache():
+        cases = draw_clean(options.rigs or list(MODELS), options.cases, options.seed)
+        for row in resumed(cases, options.out, make):
+            rows.append(row)
+            taken = row["peer_seconds"]
+            theirs = "" if taken is None else f", the peer's {_error(row, 'peer'):.2g} in {taken:.1f} s"
+            print(
+                f"{row['case']['rig']:<10} {row['rank']:.2f} error {_error(row, 'mean'):.2g} of the prior's sd in "
+                f"{row['ours_seconds']:.1f} s, {row['compile_seconds']:.1f} s of it compiling{theirs}",
+                flush=True,
+            )
+    print("\n" + summarize(rows))
+
+
+def _find_peer() -> Callable[..., Any] | None:
+    """The peer's estimator; None, and a line that says so, where what it needs is not installed."""
+    try:
+        require_peers("absl", "colorama", "jinja2", "plotly", "tabulate", "yaml")
+    except SystemExit as told:
+        print(f"{told} Without it there are no figures of mujoco.sysid.", flush=True)
+        return None
+    from benchmarks.peers.mujoco_sysid import identify
+
+    return identify
+
+
+def _infer(path: Path, case: dict[str, Any], peer: Callable[..., Any] | None) -> dict[str, Any]:
+    """The posterior of a case, the peer's estimate on the windows it was fitted to, and the seconds of both."""
+    import json
+
+    from bayessim_jax.recordings.concealing import SEALED
+    from bayessim_jax.recordings.identification import infer_case
+    from bayessim_jax.recordings.loading import load_case
+    from bayessim_jax.recordings.shots import case_model
+
+    model = case_model(load_case(path).check())
+    with watch_compilation() as compilation:
+        seconds, found = stopwatch(infer_case, jax.random.key(case["seed"]), model)
+    jax.clear_caches()
+    estimate, peer_seconds = peer(model, found.fitted) if peer else (None, None)
+    truths = json.loads((path / SEALED).read_text(encoding="utf-8"))["parameters"]
+    draws = np.asarray(found.posterior.draws)
+    rank, below = ranks(draws, np.array([truths[p.name] for p in model.case.parameters]))
+    parameters = {
+        p.name: {
+            "truth": _rounded(truths[p.name], 9),
+            "mean": _rounded(draws[:, k].mean(), 9),
+            "sd": _rounded(draws[:, k].std(), 4),
+            "below": _rounded(below[k], 4),
+            "prior_sd": _rounded(p.prior.sd, 6),
+            "peer": None if estimate is None else _rounded(estimate[k], 9),
+        }
+        for k, p in enumerate(model.case.parameters)
+    }
+    return {
+        "rank": _rounded(rank, 4),
+        "parameters": parameters,
+        "windows": len(found.fitted),
+        "refined": found.model.refined,
+        "sampler": found.posterior.sampler,
+        "ours_seconds": round(seconds, 3),
+        "compile_seconds": round(compilation.seconds, 3),
+        "peer_seconds": None if peer_seconds is None else round(peer_seconds, 3),
+    }
+
+
+def _rounded(value: float, digits: int) -> float:
+    return float(f"{value:.{digits}g}")
+
+
+def _error(row: dict[str, Any], which: str) -> float:
+    """Root mean square error of a case's parameters, in standard deviations of their priors."""
+    each = [(p[which] - p["truth"]) / p["prior_sd"] for p in row["parameters"].values()]
+    return math.sqrt(np.mean(np.square(each)))
+
+
+HEAD = """\
+| machine | cases | joint 50 % | 90 % | parameters | each 50 % | 90 % | error over the peer's | s | s, first | s, peer |
+|---|---|---|---|---|---|---|---|---|---|---|"""
+
+
+def summarize(rows: list[dict[str, Any]]) -> str:
+    """A line for each machine and one for all.
+
+    How many joint 50 % and 90 % sets hold θ*, and how many central intervals of single parameters; error over the
+    peer's: median and quartiles over cases; seconds: median without compilation, median with it the first time that a
+    machine is met, median of the peer.
+    """
+    rigs = list(dict.fromkeys(row["case"]["rig"] for row in rows))
+    lines = [HEAD] + [_line(rig, [row for row in rows if row["case"]["rig"] == rig]) for rig in rigs]
+    return "\n".join([*lines, *([_line("all", rows)] if len(rigs) > 1 else [])])
+
+
+def _line(name: str, rows: list[dict[str, Any]]) -> str:
+    rank = np.array([row["rank"] for row in rows])
+    below = np.array([p["below"] for row in rows for p in row["parameters"].values()])
+    central = 2 * np.abs(below - 0.5)
+    held = [f"{(x <= level).mean():.2f}" for x in (rank, central) for level in (0.5, 0.9)]
+    both = [row for row in rows if row["peer_seconds"] is not None]
+    ratio, theirs = "–", "–"
+    if both:
+        low, middle, high = np.quantile([_error(row, "mean") / _error(row, "peer") for row in both], [0.25, 0.5, 0.75])
+        ratio = f"{middle:.2g} ({low:.2g} – {high:.2g})"
+        theirs = f"{np.median([row['peer_seconds'] for row in both]):.1f}"
+    net = np.median([row["ours_seconds"] - row["compile_seconds"] for row in rows])
+    first = [row["ours_seconds"] for row in rows if row["first"]]
+    seconds = (f"{net:.2f}", f"{np.median(first):.1f}" if first else "–", theirs)
+    cells = (name, len(rows), *held[:2], len(below), *held[2:], ratio, *seconds)
+    return f"| {' | '.join(map(str, cells))} |"
