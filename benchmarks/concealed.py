@@ -95,7 +95,7 @@ def make_drawn(folder: Path, case: dict[str, Any]) -> dict[str, Any]:
 
     An effect that cannot be as strong as that comes nearly as strong as it can, or elsewhere.
     """
-    settings = {k: case[k] for k in ("noise", "velocities", "quantize", "jitter")}
+    settings = {k: case[k] for k in ("noise", "velocities", "quantize", "jitter", "finer") if k in case}
     told: StrengthError | None = None
     for attempt in range(ATTEMPTS):
         asked = case["strength"]

@@ -25,10 +25,10 @@ NOISE = 1.0
 """Times 1e-3 rad or 2e-4 m on positions, and ten times as much for a second on velocities."""
 
 
-def draw_clean(rigs: list[str], count: int, seed: int) -> list[dict[str, Any]]:
-    """Cases without an effect, the machines in turn; θ* comes from the seed."""
+def draw_clean(rigs: list[str], count: int, seed: int, finer: int = 1) -> list[dict[str, Any]]:
+    """Cases without an effect, the machines in turn, their time step `finer` times shorter; θ* comes from the seed."""
     same = {"group": "clean", "effects": [], "strength": 0.0, "noise": NOISE}
-    same |= {"velocities": True, "quantize": None, "jitter": 0.0}
+    same |= {"velocities": True, "quantize": None, "jitter": 0.0, "finer": finer}
     return [{"rig": rigs[i % len(rigs)], **same, "seed": seed * 100_000 + i} for i in range(count)]
 
 
@@ -57,7 +57,7 @@ def identify_clean(options: Namespace) -> None:
 
     rows = []
     with fresh_cache():
-        cases = draw_clean(options.rigs or list(MODELS), options.cases, options.seed)
+        cases = draw_clean(options.rigs or list(MODELS), options.cases, options.seed, options.finer)
         for row in resumed(cases, options.out, make):
             rows.append(row)
             taken = row["peer_seconds"]
@@ -133,16 +133,16 @@ def _error(row: dict[str, Any], which: str) -> float:
 
 
 HEAD = """\
-| machine | cases | joint 50 % | 90 % | parameters | each 50 % | 90 % | error over the peer's | s | s, first | s, peer |
-|---|---|---|---|---|---|---|---|---|---|---|"""
+| machine | cases | joint 50 % | 90 % | numbers | each 50 % | 90 % | error over the peer's | s | first | again | peer |
+|---|---|---|---|---|---|---|---|---|---|---|---|"""
 
 
 def summarize(rows: list[dict[str, Any]]) -> str:
     """A line for each machine and one for all.
 
     How many joint 50 % and 90 % sets hold θ*, and how many central intervals of single parameters; error over the
-    peer's: median and quartiles over cases; seconds: median without compilation, median with it the first time that a
-    machine is met, median of the peer.
+    peer's: median and quartiles over cases; seconds, medians: without compilation, with it the first time that a
+    machine is met, with it when programs come from the persistent cache, and the peer's.
     """
     rigs = list(dict.fromkeys(row["case"]["rig"] for row in rows))
     lines = [HEAD] + [_line(rig, [row for row in rows if row["case"]["rig"] == rig]) for rig in rigs]
@@ -161,7 +161,7 @@ def _line(name: str, rows: list[dict[str, Any]]) -> str:
         ratio = f"{middle:.2g} ({low:.2g} – {high:.2g})"
         theirs = f"{np.median([row['peer_seconds'] for row in both]):.1f}"
     net = np.median([row["ours_seconds"] - row["compile_seconds"] for row in rows])
-    first = [row["ours_seconds"] for row in rows if row["first"]]
-    seconds = (f"{net:.2f}", f"{np.median(first):.1f}" if first else "–", theirs)
+    spent = [[row["ours_seconds"] for row in rows if row["first"] == first] for first in (True, False)]
+    seconds = (f"{net:.2f}", *(f"{np.median(each):.1f}" if each else "–" for each in spent), theirs)
     cells = (name, len(rows), *held[:2], len(below), *held[2:], ratio, *seconds)
     return f"| {' | '.join(map(str, cells))} |"

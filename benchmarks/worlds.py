@@ -94,11 +94,25 @@ MODELS = ("pendulum", "slide", "double", "cart", "arm3", "arm6")
 """Those that are diagnosed unless others are asked for: one to six joints, without contacts."""
 
 
-def make_case(folder: Path, rig: str, effect: str | list[str] | None = None, **settings: Any) -> dict[str, Any]:
-    """Conceal effects in a rig; returns what is sealed."""
+STEP = "0.002"
+"""Time step of every rig, s."""
+
+
+def make_case(
+    folder: Path, rig: str, effect: str | list[str] | None = None, *, finer: int = 1, **settings: Any
+) -> dict[str, Any]:
+    """Conceal effects in a rig; returns what is sealed.
+
+    The machine is simulated with a time step that is `finer` times shorter than `conceal` takes for the rig's model.
+    """
     about = RIGS[rig]
+    own = f'timestep="{STEP}"'
+    if own not in about.xml:
+        raise ValueError(f"rig {rig}: its time step is not {STEP} s.")
     with tempfile.TemporaryDirectory() as place:
         model = Path(place) / "model.xml"
-        model.write_text(about.xml, encoding="utf-8")
-        settings = {"parameters": about.parameters, "horizon": about.horizon} | settings
-        return conceal(folder, model, effect, **settings)
+        model.write_text(about.xml.replace(own, f'timestep="{float(STEP) / finer:.9g}"'), encoding="utf-8")
+        settings = {"parameters": about.parameters, "horizon": about.horizon, "rate": 0.5 / float(STEP)} | settings
+        sealed = conceal(folder, model, effect, **settings)
+    (folder / "model.xml").write_text(about.xml, encoding="utf-8")
+    return sealed
