@@ -161,10 +161,10 @@ class Settings:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be {least} or more.")
         if not self.forget < 1:
             raise ValueError(f"forget is {self.forget}; it is a probability, from 0 to below 1.")
-        for table in (self.truth, self.change):
-            for name, value in table.items():
+        for table, hidden in (("truth", self.truth), ("change", self.change)):
+            for name, value in hidden.items():
                 if isinstance(value, str) and name != "terrain":
-                    raise ValueError(f"{name} is {value!r}; it needs a number.")
+                    raise ValueError(f"{table}.{name} is {value!r}; it needs a number.")
         if self.change and not ((when := float(self.change.get("round", 0))) >= 2 and when % 1 == 0):
             raise ValueError("change needs the round from which it holds, 2 or more, such as round=10 length=0.8.")
         if self.change and float(self.change["round"]) > self.rounds:

@@ -34,6 +34,7 @@ class MadeUp:
         self.setup = SimpleNamespace(system=CartPole.create())
         self.seeds = list(range(3, 3 + seeds))
         self.truths = Truths.constant(np.tile(np.array([0.5, 0.4], np.float32), (seeds, 1)))
+        self.hidden, self.hidden_names = self.truths, self.setup.system.parameters.names
         self.before = before
 
     def start(self):
