@@ -116,6 +116,11 @@ def _bare(name: str) -> str:
     return name.partition("#")[0]
 
 
+def _hidden(sealed: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """What is sealed of every effect, by its bare name."""
+    return {_bare(f"{e['effect']}@{e['at']}"): e for e in sealed["effects"]}
+
+
 def judge(sealed: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
     """What became of a case.
 
@@ -124,7 +129,7 @@ def judge(sealed: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
     else) or `wrong`. `joint` says whether most of the misfit was located at a joint with an effect, None where that is
     at none.
     """
-    truth = {_bare(f"{e['effect']}@{e['at']}") for e in sealed["effects"]}
+    truth = set(_hidden(sealed))
     joints = {e["joint"] for e in sealed["effects"]} - {None}
     at = table["locations"][0]["at"].removesuffix("/qpos").removesuffix("/qvel") if table["locations"] else ""
     found = table["confusion_set"] or [[f"{e['effect']}@{e['at']}" for e in table["effects"]]]
@@ -292,8 +297,7 @@ def summarize(rows: list[dict[str, Any]]) -> str:
 
 def _is_wrong(row: dict[str, Any]) -> bool:
     """Whether what fits best of all names something that is not there."""
-    truth = {_bare(f"{e['effect']}@{e['at']}") for e in row["sealed"]["effects"]}
-    return not {_bare(name) for name in row["closest"]} <= truth
+    return not {_bare(name) for name in row["closest"]} <= set(_hidden(row["sealed"]))
 
 
 def _predictions(rows: list[dict[str, Any]]) -> list[str]:
@@ -324,7 +328,7 @@ def _coverage(rows: list[dict[str, Any]]) -> list[str]:
                 off = abs(table[which]["mean"] - truth)
                 inside[which].append(off <= INSIDE * table[which]["sd"])
                 errors[which].append(off / abs(truth))
-        worlds = {_bare(f"{e['effect']}@{e['at']}"): e["parameters"] for e in row["sealed"]["effects"]}
+        worlds = {name: effect["parameters"] for name, effect in _hidden(row["sealed"]).items()}
         for effect in row["effects"]:
             own = worlds[_bare(f"{effect['effect']}@{effect['at']}")]
             for name, found in effect["parameters"].items():

@@ -201,6 +201,18 @@ class Bench:
         still = jnp.broadcast_to(delta, (shots.y.shape[0], shots.spread.size))
         return np.asarray(_replay(self.predict, x, still, self.setup(candidate, shots).inputs))
 
+    def scatter(
+        self,
+        candidate: Candidate,
+        x: Float[Array, " k"],
+        shots: Shots,
+        start: Float[np.ndarray, " n"],
+        here: Float[np.ndarray, "windows rows obs"],
+    ) -> Float[np.ndarray, "windows rows obs"]:
+        """Variance of predictions `here` where every part of the initial states is off by so much."""
+        moved = (self.replay(candidate, x, shots, jnp.asarray(move)) for move in np.diag(start))
+        return sum(((y - here) ** 2 for y in moved), np.zeros_like(here))
+
 
 def margin_of_effect(p: EffectParameter) -> Margin:
     """The prior of an effect's parameter."""

@@ -256,9 +256,8 @@ def _pair(screens: Sequence[Screen], ranked: Sequence[Screened], begun: Sequence
         tried = [pair for pair in pairs if len(pair.effects) == 2 and pair not in seen and first.takes(pair)]
         seen.update(tried)
         costs = _each(screens, tried, lambda screen, pair: screen.glance(pair, known, alone.get(pairs[pair])))
-        best = sorted(
-            (item for item in zip(costs, tried, strict=True) if np.isfinite(item[0])), key=lambda item: item[0]
-        )
+        finite = [(cost, pair) for cost, pair in zip(costs, tried, strict=True) if np.isfinite(cost)]
+        best = sorted(finite, key=lambda item: item[0])
 
         def finish(screen: Screen, pair: Candidate) -> Screened | None:
             started = screen.begin_candidate(pair, known)
@@ -327,10 +326,7 @@ def _look_ahead(bench: Bench, none: Entry, entries: Sequence[Entry], ahead: Shot
     """
     base, best = bench.replay(Candidate(), none.fit.z, ahead), entries[0]
     predicted = [bench.replay(entry.candidate, entry.fit.z, ahead) for entry in entries]
-    spread = np.zeros_like(base)
-    for move in np.diag(1.4826 * np.median(np.abs(best.fit.delta), axis=0)):
-        moved = bench.replay(best.candidate, best.fit.z, ahead, jnp.asarray(move))
-        spread = spread + np.nan_to_num((moved - predicted[0]) ** 2)
+    spread = np.nan_to_num(bench.scatter(best.candidate, best.fit.z, ahead, best.fit.usual_move, predicted[0]))
     for entry, here in zip(entries, predicted, strict=True):
         entry.ahead = error_left(ahead, here, base, entry.misfit.noise, spread)
 

@@ -23,7 +23,8 @@ from bayessim_jax.diagnosis.bench import SLOTS, Candidate, margin_of_effect
 from bayessim_jax.diagnosis.forcing import Joint, commands_of, force_of, restore_readings
 from bayessim_jax.diagnosis.response import Forcing, Linearized, Motion, Windowed, assess, linearize_steps
 from bayessim_jax.effects import Scales, at, with_effects
-from bayessim_jax.effects.drive import CAUTION, actuator_torque, actuators_of, drives_on, read_numbers
+from bayessim_jax.effects.contract import Numbers
+from bayessim_jax.effects.drive import CAUTION, actuators_of, drive_of, read_numbers
 from bayessim_jax.effects.history import split_history
 from bayessim_jax.effects.places import find_site
 from bayessim_jax.effects.wiring import edit_model
@@ -42,8 +43,8 @@ MOVED = 0.15
 class _Around:
     """Steps linearized around a motion, and what effects see of its joints."""
 
-    z: Float[np.ndarray, " d"]
-    """Where θ was."""
+    edits: tuple[tuple[int, int], ...]
+    """Effects on the model, and where the parameters of each begin in p."""
     p: Float[np.ndarray, " k"]
     """Where θ and the parameters of effects on the model were."""
     motion: Motion
@@ -87,14 +88,14 @@ class Scene:
         self.fine = next(s for s in range(min(FINE, rows), 0, -1) if rows % s == 0)
         self.h = system.dt / self.fine
         self.times = motion.start[:, None] + self.h * jnp.arange(motion.ctrl.shape[1] * self.fine)
-        self._around: dict[bool, tuple[tuple[tuple[int, int], ...], _Around]] = {}
+        self._around: dict[bool, _Around] = {}
         self._home: tuple[bytes, _Around] | None = None
         self._kept: dict[Any, Any] = {}
 
     def twin(self) -> Scene:
         """The same scene for another thread: what is kept from fit to fit is its own, compiled programs are shared."""
-        assert self.numbers is not None
         twin = copy.copy(self)
+        twin.numbers = self.numbers
         twin._around, twin._home, twin._kept = {}, None, {}
         return twin
 
@@ -145,7 +146,7 @@ class Scene:
         if self._home is None or self._home[0] != key:
             self._around = {}
             self._home = key, self._linearized(Candidate(), np.asarray(p), self.motion)
-        self._around = {False: ((), self._home[1])}
+        self._around = {False: self._home[1]}
 
     def _steps(self, candidate: Candidate) -> Bool[np.ndarray, " k"]:
         """What of p changes the steps themselves: θ, and parameters of effects on the model."""
@@ -204,16 +205,16 @@ class Scene:
         """
         edits = tuple((k, place.start) for k, place in self.offsets(candidate) if k in self.edits)
         steps = self._steps(candidate)
-        if bool(edits) in self._around:
-            last, kept = self._around[bool(edits)]
-            same = last == edits and motion is kept.motion
-            if same and np.abs(p - kept.p)[steps].max(initial=0.0) < MOVED:
+        kept = self._around.get(bool(edits))
+        if kept is not None and kept.edits == edits and kept.motion is motion:
+            moved = np.abs(p - kept.p)[steps]
+            if moved.max(initial=0.0) < MOVED:
                 return kept
         full, along = self._full(candidate, p)
         lin = linearize_steps(self.engine, self.numbers, motion, full, along, self.system.substeps, self.step)
-        around = _Around(p[: self.d], np.where(steps, p, 0.0), motion, lin, self._windowed(p, motion))
+        around = _Around(edits, np.where(steps, p, 0.0), motion, lin, self._windowed(p, motion))
         if motion is self.motion:
-            self._around[bool(edits)] = edits, around
+            self._around[bool(edits)] = around
         return around
 
     def _windowed(self, p: np.ndarray, motion: Motion) -> Windowed:
@@ -282,17 +283,21 @@ class Scene:
         if key not in around.kept:
             position, velocity = self.motion.earlier
             position, velocity = position[..., int(self.model.jnt_qposadr[joint])], velocity[..., self._dof(joint)]
-            numbers = read_numbers(self.model, self.system.engine.writes, self.margins.theta(jnp.asarray(around.z)))
-            drive = drives_on(self.model, numbers, joint, self.motion.past, position, velocity)
-            around.kept[key] = position, velocity, drive
+            past, driving = jnp.moveaxis(self.motion.past, -1, 0), actuators_of(self.model, joint)
+            drive = drive_of(self.model, self._numbers(around), driving, past, position, velocity)
+            around.kept[key] = position, velocity, drive + jnp.zeros_like(position)
         return around.kept[key]
+
+    def _numbers(self, around: _Around) -> Numbers:
+        """The model's numbers at the θ that the steps were linearized at."""
+        theta = self.margins.theta(jnp.asarray(around.p[: self.d]))
+        return read_numbers(self.model, self.system.engine.writes, theta)
 
     def _gains(self, actuators: Sequence[int], around: _Around) -> Float[np.ndarray, " act"]:
         """Forces on their joints for commands of one."""
         key = ("gains", tuple(actuators))
         if key not in around.kept:
-            theta = self.margins.theta(jnp.asarray(around.z))
-            read = read_numbers(self.model, self.system.engine.writes, theta)
+            read = self._numbers(around)
             gains = [read("actuator_gear", i, 0) * read("actuator_gainprm", i, 0) for i in actuators]
             around.kept[key] = np.array([float(gain) for gain in gains])
         return around.kept[key]
@@ -325,7 +330,7 @@ class Scene:
         if key not in around.kept:
             place = int(self.model.jnt_qposadr[joint]), self._dof(joint)
             around.kept[key] = _look_at(
-                self.system, self.margins, place, driving, self.fine, around.z, around.motion, around.lin
+                self.system, self.margins, place, driving, self.fine, around.p[: self.d], around.motion, around.lin
             )
         return around.kept[key]
 
@@ -353,10 +358,9 @@ def _look_at(
     inertia = CAUTION * system.dt / jnp.maximum(lin.b[..., nv + v, v], 1e-12)
     rise = lin.gap[..., nv + v] + motion.qvel[:, 1:, v] - motion.qvel[:, :-1, v]
     position, velocity = between(motion.qpos[..., q]), between(motion.qvel[..., v])
-    drive, numbers = jnp.zeros_like(position), read_numbers(engine.model, engine.writes, margins.theta(z))
-    for i in actuators:
-        command = jnp.repeat(motion.ctrl[..., i], fine, axis=1)
-        drive = drive + actuator_torque(engine.model, numbers, i, command, position, velocity)
+    numbers = read_numbers(engine.model, engine.writes, margins.theta(z))
+    commands = jnp.moveaxis(jnp.repeat(motion.ctrl, fine, axis=1), -1, 0)
+    drive = drive_of(engine.model, numbers, actuators, commands, position, velocity) + jnp.zeros_like(position)
     acceleration, inertia = (jnp.repeat(rows, fine, axis=1) for rows in (rise / system.dt, inertia))
     return Joint(position, velocity, acceleration, inertia, drive)
 

@@ -16,9 +16,8 @@ from bayessim_jax.contracts import Box, Scalar
 from bayessim_jax.effects.contract import Moment, Number, Numbers
 from bayessim_jax.effects.drive import (
     CAUTION,
-    actuator_torque,
     actuators_of,
-    drives_on,
+    drive_of,
     probe_inertia,
     read_numbers,
 )
@@ -391,8 +390,9 @@ class AugmentedMjcf:
             if w.effect.recalls:
                 position = qpos[:, int(model.jnt_qposadr[w.site.joint])]
                 velocity = qvel[:, self._dof(w.site.joint)]
-                drive = drives_on(model, numbers, w.site.joint, ctrl, position, velocity)
-                memories[k] = w.effect.recall(w.values(theta), memories[k], position, velocity, drive, self.dt)
+                drive = drive_of(model, numbers, actuators_of(model, w.site.joint), ctrl.T, position, velocity)
+                drives = drive + jnp.zeros_like(position)
+                memories[k] = w.effect.recall(w.values(theta), memories[k], position, velocity, drives, self.dt)
         return replace(state, memories=tuple(memories))
 
     def _push(self, inner: Float[Array, " e"], physics: Any, ctrl: Float[Array, " act"]) -> Float[Array, " nv"]:
@@ -430,9 +430,7 @@ class AugmentedMjcf:
         def of(joint: int, actuators: list[int]) -> Moment:
             q = self.engine.qpos(state.base.physics)[int(model.jnt_qposadr[joint])]
             v = self.engine.qvel(state.base.physics)[self._dof(joint)]
-            drive: Number = 0.0
-            for i in actuators:
-                drive = drive + actuator_torque(model, numbers, i, commands[i], q, v)
+            drive = drive_of(model, numbers, actuators, commands, q, v)
             inertia = grips[joint].inertia if joint in grips else 1.0
             return Moment(state.time, self._h, q, v, accelerations.get(joint, 0.0), inertia, drive)
 

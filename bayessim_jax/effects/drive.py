@@ -20,7 +20,7 @@ __all__ = [
     "CAUTION",
     "actuator_torque",
     "actuators_of",
-    "drives_on",
+    "drive_of",
     "least_share",
     "nominal_inertia",
     "probe_inertia",
@@ -66,19 +66,19 @@ def actuator_torque(
     return gear * pull
 
 
-def drives_on(
+def drive_of(
     model: mujoco.MjModel,
     numbers: Numbers,
-    joint: int,
-    ctrl: Float[Array, "*rows nu"],
-    position: Float[Array, "*rows"],
-    velocity: Float[Array, "*rows"],
-) -> Float[Array, "*rows"]:
-    """What all actuators of a joint exert on it along its motion."""
-    found = jnp.zeros_like(position)
-    for i in actuators_of(model, joint):
-        found = found + actuator_torque(model, numbers, i, ctrl[..., i], position, velocity)
-    return found
+    actuators: Sequence[int],
+    commands: Any,
+    position: Number,
+    velocity: Number,
+) -> Number:
+    """What some actuators exert together on the joint that they drive; `commands[i]` is that of the i-th of all."""
+    drive: Number = 0.0
+    for i in actuators:
+        drive = drive + actuator_torque(model, numbers, i, commands[i], position, velocity)
+    return drive
 
 
 def actuators_of(model: mujoco.MjModel, joint: int) -> list[int]:

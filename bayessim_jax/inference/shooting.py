@@ -20,6 +20,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
@@ -104,6 +105,11 @@ class Fit:
     def misses(self) -> Float[Array, "windows rows obs"]:
         """What was measured less what is predicted, in the channels' units."""
         return self.r * self.sigma
+
+    @property
+    def usual_move(self) -> Float[np.ndarray, " n"]:
+        """How far initial states are moved, as a standard deviation that few wild ones do not change."""
+        return 1.4826 * np.median(np.abs(np.asarray(self.delta)), axis=0)
 
     @property
     def along_states(self) -> Float[Array, "windows n k"]:

@@ -310,9 +310,8 @@ def _floor(bench: Bench, entry: Entry, scale: np.ndarray, model: CaseModel, shot
     """The nrmse that noise leaves to the best model: of the sensors, and of the recorded initial states, propagated."""
     noise = entry.misfit.noise
     start = start_spread(model, dataclasses.replace(entry.fit, sigma=jnp.asarray(noise)))
-    here, variance = bench.replay(entry.candidate, entry.fit.z, shots), noise**2
-    for move in np.diag(start):
-        variance = variance + (bench.replay(entry.candidate, entry.fit.z, shots, jnp.asarray(move)) - here) ** 2
+    here = bench.replay(entry.candidate, entry.fit.z, shots)
+    variance = noise**2 + bench.scatter(entry.candidate, entry.fit.z, shots, start, here)
     mask = np.asarray(shots.measured) & np.isfinite(variance)
     mask[:, 0] = False
     counts = mask.sum((0, 1))

@@ -98,8 +98,7 @@ class CaseInference:
 
 def start_spread(model: CaseModel, fit: Fit) -> Float[np.ndarray, " n"]:
     """How far recorded initial states are off: their own noise where they were measured, else what the fit found."""
-    moved = np.asarray(fit.delta)
-    found = 1.4826 * np.median(np.abs(moved), axis=0)
+    found = fit.usual_move
     if isinstance(model.system, Restarted):
         return np.asarray(fit.sigma) if len(found) == len(model.channels) else found
     joints, nv = model.case.layout.single, model.system.engine.model.nv
