@@ -257,7 +257,7 @@ def _pair(screens: Sequence[Screen], ranked: Sequence[Screened], begun: Sequence
         seen.update(tried)
         costs = _each(screens, tried, lambda screen, pair: screen.glance(pair, known, alone.get(pairs[pair])))
         finite = [(cost, pair) for cost, pair in zip(costs, tried, strict=True) if np.isfinite(cost)]
-        best = sorted(finite, key=lambda item: item[0])
+        best = sorted(finite, key=lambda item: item[0])[:GLANCED]
 
         def finish(screen: Screen, pair: Candidate) -> Screened | None:
             started = screen.begin_candidate(pair, known)
