@@ -39,6 +39,8 @@ STRENGTHS = {"weak": (0.02, 0.1)}
 """Log-uniform between these; of all other groups between 0.1 and 0.6."""
 NOISE = (0.3, 1.0, 3.0)
 ATTEMPTS = 5
+FINER = 4
+"""Times that machines take shorter time steps than `bayessim conceal` does: 1/16 of the model's own."""
 
 
 @functools.cache
@@ -50,8 +52,8 @@ def _fits(effects: list[str], rig: str) -> bool:
     return all(LAWS[name].places(_compiled(rig)) for name in effects)
 
 
-def draw_cases(rigs: list[str], count: int, seed: int) -> list[dict[str, Any]]:
-    """A stated random set, every effect in it about as often as every other."""
+def draw_cases(rigs: list[str], count: int, seed: int, finer: int = FINER) -> list[dict[str, Any]]:
+    """A stated random set, every effect in it about as often as every other; machines as in `worlds.make_case`."""
     rng = np.random.default_rng(seed)
     possible = [name for name in sorted(LAWS) if any(_fits([name], rig) for rig in rigs)]
     library = [name for name in possible if not name.startswith(UNKNOWN)]
@@ -84,6 +86,7 @@ def draw_cases(rigs: list[str], count: int, seed: int) -> list[dict[str, Any]]:
                 "velocities": bool(rng.uniform() < 0.7),
                 "quantize": float(rng.choice([2048.0, 8192.0, 32768.0])) if rng.uniform() < 0.15 else None,
                 "jitter": 0.3 if rng.uniform() < 0.15 else 0.0,
+                "finer": finer,
                 "seed": seed * 100_000 + index,
             }
         )

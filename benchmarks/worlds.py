@@ -99,7 +99,7 @@ STEP = "0.002"
 
 
 def make_case(
-    folder: Path, rig: str, effect: str | list[str] | None = None, *, finer: int = 1, **settings: Any
+    folder: Path, rig: str, effect: str | list[str] | None = None, *, finer: float = 1, **settings: Any
 ) -> dict[str, Any]:
     """Conceal effects in a rig; returns what is sealed.
 

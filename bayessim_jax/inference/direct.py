@@ -53,6 +53,10 @@ class DirectPosterior:
     """Effective share of Laplace's draws as an importance sample: 1 where the posterior is Gaussian in z."""
     sampler: str = struct.field(pytree_node=False)
 
+    def marginal(self, d: int) -> DirectPosterior:
+        """Of the first d parameters alone."""
+        return dataclasses.replace(self, draws=self.draws[:, :d], z=self.z[:, :d], fit=self.fit.marginal(d))
+
 
 LEAST_SHARE = 0.1
 """Of the numbers measured, that noise is taken to have in the residuals however many are fitted."""

@@ -14,6 +14,7 @@ Source: Bock 1983 (multiple shooting); Marquardt 1963 (damping); Nocedal and Wri
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -110,6 +111,18 @@ class Fit:
     def usual_move(self) -> Float[np.ndarray, " n"]:
         """How far initial states are moved, as a standard deviation that few wild ones do not change."""
         return 1.4826 * np.median(np.abs(np.asarray(self.delta)), axis=0)
+
+    def marginal(self, d: int) -> Fit:
+        """The fit of the first d of z alone, the others eliminated."""
+        covariance = jnp.linalg.inv(self.precision)[:d, :d]
+        along = jnp.linalg.solve(self.precision[d:, d:], self.precision[d:, :d])
+        return dataclasses.replace(
+            self,
+            z=self.z[:d],
+            precision=jnp.linalg.inv(covariance),
+            pulls=self.pulls[:, :d] - self.pulls[:, d:] @ along,
+            slopes=jnp.delete(self.slopes, jnp.arange(d, self.z.size), axis=1),
+        )
 
     @property
     def along_states(self) -> Float[Array, "windows n k"]:

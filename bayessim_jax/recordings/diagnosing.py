@@ -25,8 +25,9 @@ from bayessim_jax.effects import EFFECTS, Scales, effect_places, recorded_scales
 from bayessim_jax.inference.scores import Score, compare, error_spread, score
 from bayessim_jax.inference.shooting import Shots, robust_covariance
 from bayessim_jax.recordings.experiments import advise, next_experiment
-from bayessim_jax.recordings.identification import Settled, channel_scale, settle_step, start_spread
+from bayessim_jax.recordings.identification import channel_scale, start_spread
 from bayessim_jax.recordings.shots import CaseModel, split_windows, take
+from bayessim_jax.recordings.stepping import Settled, settle_step
 from bayessim_jax.recordings.windows import Windows, cut_windows
 
 __all__ = ["CaseDiagnosis", "diagnose_case"]
@@ -260,7 +261,7 @@ def diagnose_case(
     taken = _take_case(fit_key, model, list(EFFECTS.values()) if effects is None else effects, say)
     model, windows, chosen = taken.model, taken.windows, taken.chosen
     say(f"{int(chosen.sum())} windows choose, {int((~chosen).sum())} judge")
-    plain, none = detect(key, taken.whole, taken.settled.fit, taken.settled.error)
+    plain, none = detect(key, taken.whole, taken.settled.fit.marginal(model.margins.size), taken.settled.error)
     say(f"no mismatch has p = {none.misfit.p_value:.3f}")
     residual = None
     if not is_mismatch(taken.whole, none, thresholds):

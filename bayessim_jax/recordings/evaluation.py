@@ -56,6 +56,7 @@ def write_state(folder: RunFolder, diagnosis: CaseDiagnosis) -> None:
         "channels": list(bench.channels),
         "scale": diagnosis.scale.tolist(),
         "refined": diagnosis.model.refined,
+        "nearest": diagnosis.model.nearest,
         "noise_floor": diagnosis.noise_floor,
         "scales": {place: dataclasses.asdict(s) for place, s in bench.scales.items()},
         "simulators": entries,
@@ -84,7 +85,7 @@ def evaluate_run(run: RunFolder, pattern: str) -> dict[str, Any]:
     state = read_table(run.path / STATE)
     case = load_case(Path(run.read_config()["case"])).check()
     case = with_recordings(case, pattern)
-    model = case_model(case, refined=int(state["refined"]), before=BEFORE)
+    model = case_model(case, refined=int(state["nearest"]), before=BEFORE)
     windows = model.windows(range(len(model.recordings)))
     shots = model.shots(windows)
     places = [state["channels"].index(c) for c in model.channels if c in state["channels"]]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -12,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from bayessim_jax.diagnosis.whiteness import difference_noise
-from bayessim_jax.inference.direct import DirectPosterior, fit_direct, noise_floor, sample_direct
+from bayessim_jax.inference.direct import DirectPosterior, sample_direct
 from bayessim_jax.inference.identifiability import Identifiability, find_unidentified
 from bayessim_jax.inference.replay import Restarted
 from bayessim_jax.inference.scores import (
@@ -26,10 +24,11 @@ from bayessim_jax.inference.scores import (
     smallest_error,
 )
 from bayessim_jax.inference.shooting import Fit, Shots, ridge
-from bayessim_jax.recordings.shots import CaseModel, case_model, predictor, split_windows
+from bayessim_jax.recordings.shots import CaseModel, predictor, split_windows
+from bayessim_jax.recordings.stepping import settle_step
 from bayessim_jax.recordings.windows import Windows
 
-__all__ = ["CaseInference", "Settled", "channel_scale", "infer_case", "settle_step", "start_spread"]
+__all__ = ["CaseInference", "channel_scale", "infer_case", "start_spread"]
 
 DRAWS = 2000
 BAND = 24
@@ -128,14 +127,15 @@ def infer_case(
     fitted, held = split_windows(model)
     say(f"fitting {len(fitted)} windows of {model.case.case.horizon:g} s; {len(held)} are kept to judge by")
     settled = settle_step(fit_key, model, fitted, say=say)
-    model, fit = settled.model, settled.fit
+    model = settled.model
     predict, shots, left = predictor(model), model.shots(fitted), model.shots(held)
     say("sampling the posterior")
-    posterior = sample_direct(draw_key, predict, shots, model.margins, fit, draws=draws, step=model.step, exact=exact)
+    wide = (settled.predict, settled.shots, settled.margins, settled.fit)
+    posterior = sample_direct(draw_key, *wide, draws=draws, step=model.step, exact=exact).marginal(model.margins.size)
     say("predicting held-out windows")
     prior_mean = jnp.asarray([p.prior.mean for p in model.case.parameters])
     points = {"baseline": model.margins.standard(prior_mean), "posterior": posterior.z.mean(0)}
-    scale = channel_scale(shots, left)
+    scale, fit = channel_scale(shots, left), posterior.fit
     scores, predictions = {}, {}
     for name, z in points.items():
         predictions[name] = predict_windows(predict, left, z)
@@ -143,7 +143,6 @@ def infer_case(
         judged = compare(predictions[name], np.asarray(left.y), np.asarray(left.measured))
         scores[name] = score(judged, spread, scale, model.channels)
     band = np.stack([predict_windows(predict, left, z) for z in posterior.z[:: max(draws // BAND, 1)][:BAND]])
-    around = ridge(fit)
     return CaseInference(
         model=model,
         posterior=posterior,
@@ -152,57 +151,9 @@ def infer_case(
         predictions=predictions,
         band=band,
         scores=scores,
-        noise_floor=smallest_error(around, shots, start_spread(model, fit), scale),
+        noise_floor=smallest_error(ridge(fit), shots, start_spread(model, fit), scale),
         identifiability=find_unidentified(np.asarray(posterior.z), model.margins.names),
     )
-
-
-@dataclass(frozen=True)
-class Settled:
-    """A case on a time step that its recordings can bear, and its fit."""
-
-    model: CaseModel
-    fit: Fit
-    error: Float[np.ndarray, "windows rows obs"]
-    """About what the time step of the simulation does to predictions, in the channels' units."""
-
-
-def settle_step(
-    key: Array, model: CaseModel, windows: Windows, *, say: Callable[[str], None] = lambda text: None
-) -> Settled:
-    """Fit a case, on the model's own time step or, where that is too coarse for the noise, on a finer one.
-
-    An integration error looks like missing physics. Where the error of the model's time step is of the size of the
-    sensors' noise, the fit is repeated with a quarter of it, and kept unless it explains the recordings less well: a
-    machine takes no steps.
-    """
-    predict, shots = predictor(model), model.shots(windows)
-    fit = fit_direct(key, predict, shots, model.margins.size, step=model.step, say=say)
-    if isinstance(model.system, Restarted):
-        return Settled(model, fit, np.zeros(shots.y.shape))
-    finer = case_model(model.case, engine=model.engine_name, before=model.before, refined=REFINED * model.refined)
-    coarse = predict_windows(predict, shots, fit.z, fit.delta)
-    fine = predict_windows(predictor(finer), shots, fit.z, fit.delta)
-    error = np.where(np.asarray(shots.measured) & np.isfinite(coarse - fine), coarse - fine, 0.0)
-    measured = np.asarray(shots.measured)
-    noise = difference_noise(np.where(measured, np.nan_to_num(np.asarray(shots.y) - coarse), 0.0), measured)
-    typical = np.sqrt(np.median((error**2).sum(1) / np.maximum(measured.sum(1), 1), axis=0))
-    size = float((typical / np.maximum(noise, np.asarray(noise_floor(shots)))).max())
-    if not size > NEGLIGIBLE:
-        return Settled(model, fit, error)
-    again = fit_direct(key, predictor(finer), shots, model.margins.size, start=fit, step=model.step, say=say)
-    gain = float((np.log(np.asarray(fit.sigma) / np.asarray(again.sigma))).mean())
-    h = model.system.dt / model.system.substeps
-    if gain < -0.01:
-        return Settled(model, fit, error)
-    remark = f"time step {h / REFINED:g} s instead of {h:g} s: the integration error is {size:.1f} times the noise"
-    say(remark)
-    return Settled(dataclasses.replace(finer, remarks=(*finer.remarks, remark)), again, error / REFINED)
-
-
-REFINED = 4
-NEGLIGIBLE = 0.3
-"""Of the noise: an integration error that is smaller changes nothing."""
 
 
 def channel_scale(*shots: Shots) -> Float[np.ndarray, " obs"]:

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from bayessim_jax.beliefs.margins import Margin, Margins, log_normal, normal, uniform
 from bayessim_jax.inference.replay import Inputs, Restarted, make_predictor
+from bayessim_jax.inference.scores import predict_windows
 from bayessim_jax.inference.shooting import Shots
 from bayessim_jax.recordings.priors import LogNormal, Normal, Prior
 from bayessim_jax.recordings.recording import CaseRecording, resample
@@ -25,8 +26,22 @@ from bayessim_jax.systems.mjcf import MjcfSystem, Unknown, mjcf_system
 if TYPE_CHECKING:
     from bayessim_jax.recordings.loading import LoadedCase
 
-__all__ = ["CaseModel", "case_model", "margin_of", "margins_of", "predictor", "split_windows", "take"]
+__all__ = [
+    "REFINED",
+    "CaseModel",
+    "StepError",
+    "case_model",
+    "margin_of",
+    "margins_of",
+    "predictor",
+    "split_windows",
+    "take",
+]
 
+REFINED = 4
+"""Time steps of a finer simulation in one of the model's own."""
+WILD = 10.0
+"""Times a usual window's error of the time step: larger ones are not of first order."""
 JITTER = 0.02
 """Share of a step by which rows may lie off a uniform grid before a recording is put on one."""
 
@@ -61,11 +76,21 @@ class CaseModel:
     """s of commands before a window that are kept."""
     refined: int = 1
     """Time steps of the simulation in one of the model's own."""
+    step_error: StepError | None = None
+    """What the time step does to predictions, of which recordings are freed."""
 
     @property
     def step(self) -> float:
         """Length of the differences that stand for derivatives; 0 where the engine is differentiable."""
         return 1e-3 if self.engine_name == "mujoco" else 0.0
+
+    @property
+    def nearest(self) -> int:
+        """Time steps in one of the model's own with which simulations come nearest to what was recorded."""
+        if self.step_error is None:
+            return self.refined
+        ratio = self.step_error.ratio
+        return min((1, REFINED), key=lambda refined: abs(1 / refined - ratio))
 
     @property
     def engine_name(self) -> str:
@@ -92,7 +117,7 @@ class CaseModel:
 
     def shots(self, windows: Windows) -> Shots:
         """Windows as the solver takes them."""
-        return Shots(
+        shots = Shots(
             inputs=self.inputs(windows),
             y=jnp.asarray(self._stack(windows.qpos, windows.qvel, windows.sensors)),
             measured=jnp.asarray(
@@ -101,6 +126,9 @@ class CaseModel:
             ),
             spread=jnp.asarray(self._spread()),
         )
+        if self.step_error is None:
+            return shots
+        return dataclasses.replace(shots, y=shots.y - self.step_error.offset(shots, self.refined))
 
     def inputs(self, windows: Windows) -> Inputs:
         """Initial states and commands; what came before, for effects that remember it, with smoothed motion."""
@@ -134,6 +162,32 @@ class CaseModel:
         step = np.concatenate([_motions(self.system.engine.model, r.qpos) for r in self.recordings])
         place = np.maximum(np.abs(step).std(0) + np.abs(step).mean(0), 1e-3) if len(step) else np.ones(nv)
         return np.concatenate([place, np.maximum(qvel.std(0), 1e-2)])
+
+
+@dataclass(frozen=True, eq=False)
+class StepError:
+    """What the time step h of a simulation does to predictions, at one z; the time step of recordings is s h."""
+
+    coarse: CaseModel
+    finer: CaseModel
+    """With h/4."""
+    z: Float[Array, " d"]
+    ratio: float = 0.0
+    """The s of what was recorded: 0 for a machine."""
+
+    def drift(
+        self, shots: Shots, delta: Float[Array, "windows n"] | None = None
+    ) -> Float[np.ndarray, "windows rows obs"]:
+        """y(0) − y(h) to first order, zero where nothing was measured and where it is not of first order."""
+        coarse, fine = (predict_windows(predictor(m), shots, self.z, delta) for m in (self.coarse, self.finer))
+        found = (fine - coarse) / (1 - 1 / REFINED)
+        found = np.where(np.asarray(shots.measured) & np.isfinite(found), found, 0.0)
+        size = np.sqrt((found**2).mean(1, keepdims=True))
+        return np.where(size <= WILD * np.median(size, axis=0), found, 0.0)
+
+    def offset(self, shots: Shots, refined: int) -> Float[np.ndarray, "windows rows obs"]:
+        """What has to be added to predictions of a simulation with h / `refined`."""
+        return (1 / refined - self.ratio) * self.drift(shots)
 
 
 def _coast(model: CaseModel, qpos: np.ndarray, moves: np.ndarray) -> np.ndarray:

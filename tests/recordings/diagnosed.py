@@ -51,6 +51,7 @@ def write_diagnosis(
         "schema": 1,
         "channels": names,
         "refined": 1,
+        "nearest": 1,
         "scales": {"joint/hinge": dataclasses.asdict(Scales())},
         "simulators": {
             "baseline": {"effects": [], "theta": [0.4], "values": [], **common},

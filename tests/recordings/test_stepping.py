@@ -1,0 +1,89 @@
+"""`settle_step`: recordings of machines, which take no steps, and of simulators with other steps than the model's."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bayessim_jax.inference.direct import fit_direct
+from bayessim_jax.recordings.loading import load_case
+from bayessim_jax.recordings.shots import StepError, case_model, predictor, split_windows
+from bayessim_jax.recordings.stepping import RATIO, settle_step
+from benchmarks.worlds import STEP, make_case
+
+
+@pytest.fixture(autouse=True)
+def in_double_precision():
+    jax.config.update("jax_enable_x64", True)
+    yield
+    jax.config.update("jax_enable_x64", False)
+
+
+@pytest.fixture
+def coasting(tmp_path):
+    make_case(tmp_path / "case", "slide", recordings=2, seconds=2.0, noise=0.0)
+    return case_model(load_case(tmp_path / "case").check())
+
+
+def constant(windows, command):
+    return dataclasses.replace(windows, ctrl=np.full_like(windows.ctrl, command))
+
+
+def test_the_error_of_a_constant_push_is_the_one_in_closed_form(coasting):
+    """Semi-implicit Euler under an acceleration a: q(t) = v t + a t² / 2 + a h t / 2, and the speed is exact."""
+    finer = case_model(coasting.case, refined=4)
+    z, command = jnp.array([0.3]), 2.0
+    windows = constant(split_windows(coasting)[0], command)
+    drift = StepError(coasting, finer, z).drift(coasting.shots(windows))
+    mass = float(coasting.margins.theta(z)[0])
+    gear = float(coasting.compiled.actuator_gear[0, 0])
+    damping = float(coasting.compiled.dof_damping[0])
+    assert damping == 0.0
+    time = windows.time if windows.time.ndim == 1 else windows.time[0]
+    expected = -0.5 * command * gear / mass * float(STEP) * time
+    np.testing.assert_allclose(drift[..., 0], np.broadcast_to(expected, drift.shape[:2]), rtol=2e-2, atol=1e-9)
+    np.testing.assert_allclose(drift[..., 1], 0.0, atol=1e-9)
+
+
+def test_recordings_are_freed_of_the_error_of_the_step_that_is_taken(coasting):
+    finer = case_model(coasting.case, refined=4)
+    windows = split_windows(coasting)[0]
+    error = StepError(coasting, finer, jnp.array([0.3]), ratio=0.1)
+    raw, drift = np.asarray(coasting.shots(windows).y), error.drift(coasting.shots(windows))
+    for model, own in ((coasting, 1.0), (finer, 0.25)):
+        freed = dataclasses.replace(model, step_error=error).shots(windows)
+        np.testing.assert_allclose(raw - np.asarray(freed.y), (own - 0.1) * drift, atol=1e-12)
+    assert np.abs(drift).max() > 1e-6
+
+
+@pytest.mark.parametrize("finer", [0.5, 16.0])
+def test_the_step_of_what_was_recorded_is_found_and_does_not_bend_parameters(tmp_path, finer):
+    sealed = make_case(
+        tmp_path / "case", "double", finer=finer, noise=0.1, rate=125.0, recordings=4, seconds=3.0, seed=2
+    )
+    model = case_model(load_case(tmp_path / "case").check())
+    windows = split_windows(model)[0]
+    settled = settle_step(jax.random.key(0), model, windows)
+    sd = np.sqrt(np.diag(np.linalg.inv(np.asarray(settled.fit.precision))))
+    truth = np.asarray(model.margins.standard(jnp.array(list(sealed["parameters"].values()))))
+    assert abs(float(RATIO.value(settled.fit.z[-1])) - 0.25 / finer) < 4 * RATIO.b * sd[-1]
+    assert RATIO.b * sd[-1] < 0.02
+    assert settled.model.step_error.ratio == pytest.approx(0.25 / finer, abs=0.02)
+    assert (np.abs(np.asarray(settled.fit.z[:-1]) - truth) < 4 * sd[:-1]).all()
+    plain = fit_direct(jax.random.key(0), predictor(model), model.shots(windows), 2)
+    assert (np.abs(np.asarray(plain.z) - truth) > 8 * sd[:-1]).any()
+
+
+def test_the_fit_of_some_parameters_is_the_margin_of_that_of_all(tmp_path):
+    make_case(tmp_path / "case", "double", noise=1.0, recordings=2, seconds=2.0)
+    model = case_model(load_case(tmp_path / "case").check())
+    fit = fit_direct(jax.random.key(0), predictor(model), model.shots(split_windows(model)[0]), 2)
+    one = fit.marginal(1)
+    covariance = np.linalg.inv(np.asarray(fit.precision))
+    np.testing.assert_allclose(1 / float(one.precision[0, 0]), covariance[0, 0], rtol=1e-9)
+    assert one.slopes.shape[1] == fit.slopes.shape[1] - 1
+    np.testing.assert_array_equal(one.along_states, fit.along_states)
+    # where the second parameter is at its best, so is the first of the margin
+    np.testing.assert_allclose(one.pulls.sum(0) - one.z, 0.0, atol=1e-3 * np.sqrt(float(one.precision[0, 0])))
