@@ -54,7 +54,7 @@ class CaseRun:
         from bayessim_jax.recordings.loading import load_case
 
         try:
-            loaded = load_case(case).check()
+            loaded = load_case(case, mask=bool(settings["mask"])).check()
             if not loaded.parameters and name == "infer":
                 raise ValueError(f"{case}: case.toml names no parameters to infer; add [[parameters]].")
             if loaded.model is None and name == "diagnose":

@@ -27,6 +27,8 @@ class Check:
 
     case: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="CASE")]]
     """The case: a folder with a case.toml."""
+    mask: bool = False
+    """Use recordings in which numbers are missing or gaps are longer than a window: nothing is compared there."""
 
 
 def check(words: Sequence[str]) -> int:
@@ -38,7 +40,7 @@ def check(words: Sequence[str]) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):  # names and units as they are, wherever they can be shown
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
-        loaded = load_case(command.case)
+        loaded = load_case(command.case, mask=command.mask)
     except ValueError as error:
         raise UsageError(str(error)) from error
     for line in describe(loaded):

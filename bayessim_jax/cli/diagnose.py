@@ -26,6 +26,8 @@ class Diagnose:
     """Run folder to make; runs/CASE-diagnose by default."""
     engine: Literal["auto", "tree", "mujoco", "mjx"] = "auto"
     """What steps the model."""
+    mask: bool = False
+    """Use recordings in which numbers are missing or gaps are longer than a window: nothing is compared there."""
     seed: int = 0
     """Seed of everything random."""
     quiet: bool = False
@@ -39,7 +41,7 @@ def diagnose(words: Sequence[str]) -> int:
         raise UsageError(f"seed is {command.seed}; give 0 or more.")
     from bayessim_jax.cli.case_run import CaseRun
 
-    settings = {"engine": command.engine, "seed": command.seed}
+    settings = {"engine": command.engine, "mask": command.mask, "seed": command.seed}
     with CaseRun.open("diagnose", command.case, command.out, settings, list(words), command.quiet) as run:
         import jax
 

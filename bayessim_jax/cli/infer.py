@@ -29,6 +29,8 @@ class Infer:
     approximation alone."""
     engine: Literal["auto", "tree", "mujoco", "mjx"] = "auto"
     """What steps the model."""
+    mask: bool = False
+    """Use recordings in which numbers are missing or gaps are longer than a window: nothing is compared there."""
     seed: int = 0
     """Seed of everything random."""
     draws: int = 2000
@@ -49,6 +51,7 @@ def infer(words: Sequence[str]) -> int:
     settings = {
         "method": command.method,
         "engine": command.engine,
+        "mask": command.mask,
         "seed": command.seed,
         "draws": command.draws,
     }

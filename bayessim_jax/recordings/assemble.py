@@ -6,7 +6,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bayessim_jax.recordings.checks import check_columns, check_missing, check_time, gap_limit, gaps
+from bayessim_jax.recordings.checks import (
+    MASKED,
+    SPARSE,
+    check_columns,
+    check_missing,
+    check_time,
+    gap_limit,
+    gaps,
+)
 from bayessim_jax.recordings.readers import Table, read_table
 from bayessim_jax.recordings.recording import CaseRecording
 from bayessim_jax.recordings.states import fill_in, joint_velocities
@@ -22,20 +30,20 @@ if TYPE_CHECKING:
 
 __all__ = ["read_recording"]
 
-SPARSE = 0.2
-"""A command that is left empty in a larger share of the rows than this was logged at a lower rate, and is held."""
-
 
 def read_recording(
-    path: Path, layout: Layout, channels: Mapping[str, ChannelSpec]
+    path: Path, layout: Layout, channels: Mapping[str, ChannelSpec], horizon: float = np.inf
 ) -> tuple[CaseRecording | None, list[Finding]]:
-    """Read one file into the simulator's arrays; without a recording where an error was found. Never raises for it."""
+    """Read one file into the simulator's arrays; without a recording where an error was found. Never raises for it.
+
+    Gaps that are longer than `horizon` are told as holes.
+    """
     with np.errstate(all="ignore"):  # absurd numbers overflow in what is computed of them only
-        return _read(path, layout, channels)
+        return _read(path, layout, channels, horizon)
 
 
 def _read(
-    path: Path, layout: Layout, channels: Mapping[str, ChannelSpec]
+    path: Path, layout: Layout, channels: Mapping[str, ChannelSpec], horizon: float
 ) -> tuple[CaseRecording | None, list[Finding]]:
     file = path.name
     columns = {name: channels[name].column if name in channels else name for name in ("time", *layout.channels)}
@@ -59,7 +67,7 @@ def _read(
         found += check_missing(file, name, values, name not in layout.qvel, _remedy(name, values, table, layout))
     if any(f.severity == "error" for f in found):
         return None, found
-    recording, more = _assemble(file, time, data, layout, table.asynchronous)
+    recording, more = _assemble(file, time, data, layout, table.asynchronous, horizon)
     found += more
     if not recording.valid.any():
         what = "holds no two rows without a gap and with known commands"
@@ -72,16 +80,16 @@ def _remedy(name: str, values: np.ndarray, table: Table, layout: Layout) -> str:
     if table.asynchronous:
         return ""
     if name not in layout.ctrl:
-        return "it is masked there; fill it in where you know it"
+        return MASKED
     if np.isfinite(values).mean() < 1 - SPARSE:
         return "it is held where it is missing; fill it in where it changed"
     return "no window is compared there; fill in what was commanded"
 
 
 def _assemble(
-    file: str, time: np.ndarray, data: dict[str, np.ndarray], layout: Layout, asynchronous: bool
+    file: str, time: np.ndarray, data: dict[str, np.ndarray], layout: Layout, asynchronous: bool, horizon: float
 ) -> tuple[CaseRecording, list[Finding]]:
-    wide, found = gaps(file, time)
+    wide, found = gaps(file, time, horizon=horizon)
     valid = ~wide
     ctrl = np.zeros((len(time), len(layout.ctrl)))
     for i, name in enumerate(layout.ctrl):
@@ -98,7 +106,7 @@ def _assemble(
             found += more
         qpos_measured[:, i] = np.isfinite(values)
         if asynchronous:
-            found += gaps(file, time[qpos_measured[:, i]], name)[1]
+            found += gaps(file, time[qpos_measured[:, i]], name, horizon)[1]
         qpos[:, i], near = fill_in(time, values)
         known &= near
     found += _normalized(file, qpos, layout)
@@ -109,7 +117,7 @@ def _assemble(
         values = data.pop(name, None)
         if values is not None and np.isfinite(values).any():
             seen[:, i] = np.isfinite(values)
-            found += gaps(file, time[seen[:, i]], name)[1] if asynchronous else []
+            found += gaps(file, time[seen[:, i]], name, horizon)[1] if asynchronous else []
             sensors[:, i], near = fill_in(time, values)
             known &= near | bool(layout.qpos)
     parts = (time, ctrl, qpos, np.nan_to_num(qvel), sensors, qpos_measured, qvel_measured, seen, valid, known)

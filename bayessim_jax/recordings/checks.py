@@ -15,8 +15,11 @@ if TYPE_CHECKING:
     from bayessim_jax.recordings.layout import Layout
     from bayessim_jax.recordings.readers import Table
 
-__all__ = ["check_columns", "check_missing", "check_time", "gap_limit", "gaps"]
+__all__ = ["MASKED", "SPARSE", "check_columns", "check_missing", "check_time", "gap_limit", "gaps"]
 
+SPARSE = 0.2
+"""Share of missing numbers from which a channel is a slower log than the file."""
+MASKED = "it is masked there; fill it in where you know it"
 GAP = 5.0
 """A step longer than this many median steps is a gap."""
 LISTED = 8
@@ -91,9 +94,12 @@ def check_missing(
     channel: str,
     values: Float[np.ndarray, " rows"],
     needed: bool = True,
-    remedy: str = "it is masked there; fill it in where you know it",
+    remedy: str = MASKED,
 ) -> list[Finding]:
-    """NaN and infinite numbers in a channel: a warning where there are some, an error where nothing is left."""
+    """NaN and infinite numbers in a channel: a hole where there are some, an error where nothing is left.
+
+    In a channel of a slower log, where many are missing, they are a warning.
+    """
     bad = ~np.isfinite(values)
     count, rows = int(bad.sum()), len(values)
     if count == rows:
@@ -104,7 +110,8 @@ def check_missing(
     row = int(np.flatnonzero(bad)[0])
     word = "is empty or NaN" if np.isnan(values[bad]).all() else "is not finite"
     what = f"{channel} {word} in {count} of {rows} rows, first here" if count > 1 else f"{channel} {word}"
-    return [Finding("warning", file, what, remedy, row + 1)]
+    severity = "hole" if count <= SPARSE * rows else "warning"
+    return [Finding(severity, file, what, remedy, row + 1)]
 
 
 def gap_limit(time: Float[np.ndarray, " rows"]) -> float:
@@ -113,22 +120,25 @@ def gap_limit(time: Float[np.ndarray, " rows"]) -> float:
 
 
 def gaps(
-    file: str, time: Float[np.ndarray, " rows"], channel: str = ""
+    file: str, time: Float[np.ndarray, " rows"], channel: str = "", horizon: float = np.inf
 ) -> tuple[Bool[np.ndarray, " steps"], list[Finding]]:
-    """Which steps are gaps, and a warning for each of the first ones; `channel` where it is one channel's own times."""
+    """Which steps are gaps, and a line for each of the first ones; `channel` where it is one channel's own times.
+
+    A gap that is longer than a window is a hole: there are two recordings in the file.
+    """
     steps = np.diff(time)
     wide = steps > gap_limit(time)
     rows = np.flatnonzero(wide)
     of = f"{channel} has a gap" if channel else "gap"
     found = [
         Finding(
-            "warning",
+            "hole" if long else "warning",
             file,
             f"{of} of {steps[row]:.4g} s from {time[row]:.9g} to {time[row + 1]:.9g} s",
-            "no window is compared across it; record again if it matters",
+            "no window is compared across it; " + ("split the file there" if long else "record again if it matters"),
             None if channel else int(row) + 2,
         )
-        for row in rows[:LISTED]
+        for row, long in zip(rows[:LISTED], steps[rows] > horizon, strict=False)
     ]
     if len(rows) > LISTED:
         what = f"{len(rows) - LISTED} more gaps, {steps[rows[LISTED:]].sum():.4g} s in all"

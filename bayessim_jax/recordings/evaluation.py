@@ -83,7 +83,7 @@ def evaluate_run(run: RunFolder, pattern: str) -> dict[str, Any]:
     Raises `ValueError` where a file cannot be read or no recording holds a window.
     """
     state = read_table(run.path / STATE)
-    case = load_case(Path(run.read_config()["case"])).check()
+    case = load_case(Path(run.read_config()["case"]), mask=True).check()
     case = with_recordings(case, pattern)
     model = case_model(case, refined=int(state["nearest"]), before=BEFORE)
     windows = model.windows(range(len(model.recordings)))

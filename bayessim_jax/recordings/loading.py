@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from bayessim_jax.recordings.assemble import read_recording
@@ -69,9 +69,10 @@ class LoadedCase:
         return spec, write_values(spec, places)  # type: ignore[arg-type]
 
 
-def load_case(folder: Path) -> LoadedCase:
+def load_case(folder: Path, *, mask: bool = False) -> LoadedCase:
     """Read a case folder and check all of it.
 
+    Numbers that are missing, and gaps longer than a window, are errors, unless to `mask` them is asked for.
     Raises `CaseError` where `case.toml` or the model cannot be read, because nothing more can be said then; what is
     wrong with parameters and recordings is among the findings.
     """
@@ -100,7 +101,18 @@ def load_case(folder: Path) -> LoadedCase:
     if not _unnamed(case, layout):
         recordings, more = _recordings(case, layout)
         found += more
-    return LoadedCase(case, layout, parameters, tuple(recordings), tuple(merge(found)), model, spec)
+    return LoadedCase(case, layout, parameters, tuple(recordings), tuple(_judge_holes(merge(found), mask)), model, spec)
+
+
+def _judge_holes(findings: list[Finding], mask: bool) -> list[Finding]:
+    """Holes as what they are to the one who asks: masked and told, or errors until they are."""
+
+    def judge(hole: Finding) -> Finding:
+        if mask:
+            return replace(hole, severity="warning")
+        return replace(hole, severity="error", remedy=f"{hole.remedy.rpartition('; ')[2]}, or give --mask")
+
+    return [judge(finding) if finding.severity == "hole" else finding for finding in findings]
 
 
 def _channels(case: Case, layout: Layout) -> list[Finding]:
@@ -139,7 +151,7 @@ def _recordings(case: Case, layout: Layout) -> tuple[list[CaseRecording], list[F
     recordings: list[CaseRecording] = []
     counts = []
     for path in files:
-        recording, more = read_recording(path, layout, case.channels)
+        recording, more = read_recording(path, layout, case.channels, case.horizon)
         found += more
         if recording is not None:
             recordings.append(recording)

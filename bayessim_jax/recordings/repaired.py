@@ -202,7 +202,9 @@ def load_repaired(path: Path) -> Repaired:
         verdict = str(table["verdict"])
         which = "augmented" if verdict in ("explained", "ambiguous") else "baseline"
         model = case_model(
-            load_case(Path(config["case"])).check(), engine=str(config["engine"]), refined=int(state["refined"])
+            load_case(Path(config["case"]), mask=True).check(),
+            engine=str(config["engine"]),
+            refined=int(state["refined"]),
         )
         simulator, mean = simulator_of(model, state, which)
         sds = [entry[which]["sd"] for entry in table["parameters"].values()]

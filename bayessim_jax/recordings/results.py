@@ -178,7 +178,7 @@ def sample_models(run: str | Path, n: int, *, seed: int = 0) -> list[Any]:
     derived quantities included. Raises `ValueError` where a file is missing or damaged.
     """
     folder = RunFolder.open(Path(run))
-    case = load_case(Path(folder.read_config()["case"])).check()
+    case = load_case(Path(folder.read_config()["case"]), mask=True).check()
     group = read_group(folder.path / "posterior.nc", "posterior")
     names = [p.name for p in case.parameters]
     draws = np.stack([group[name].values.reshape(-1) for name in names], axis=-1)

@@ -19,8 +19,9 @@ LONGEST = 60
 class Finding:
     """Something to know about a file before it is used.
 
-    An `error` stops; a `warning` says what will not be used, or not as it stands; a `suspicion` says
-    that numbers are possible but unlikely, such as angles in degrees. `row` counts from 1 below the header.
+    An `error` stops; a `hole` in the data stops unless it is to be masked; a `warning` says what will not be used, or
+    not as it stands; a `suspicion` says that numbers are possible but unlikely, such as angles in degrees. `row` counts
+    from 1 below the header.
     """
 
     severity: str

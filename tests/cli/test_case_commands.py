@@ -256,6 +256,20 @@ BROKEN = {
         ["model.xml: joint 0 (of body bob) has no name", "name it"],
     ),
     "size of a mesh-like geom": ({"case": toml(TARGET, '"geom/floor/size/0"')}, ["has no sizes that can be set"]),
+    "NaN": ({"run1": csv(qpos=put(30, "nan"))}, ["run1.csv, row 31 (line 32): joint/hinge/qpos is empty or NaN"]),
+    "empty cells": (
+        {"run1": csv(qvel=lambda v: put(slice(10, 14), "")(v))},
+        [
+            "run1.csv, row 11",
+            "joint/hinge/qvel is empty or NaN in 4 of 400 rows",
+            "fill it in where you know it, or give --mask",
+        ],
+    ),
+    "infinite": ({"run1": csv(qpos=put(30, "inf"))}, ["run1.csv, row 31", "joint/hinge/qpos is not finite"]),
+    "gap": (
+        {"run1": csv(time=lambda t: np.where(t >= 2, t + 1, t))},
+        ["run1.csv, row 201 (line 202): gap of 1.01 s from 1.99 to 3 s", "split the file there, or give --mask"],
+    ),
 }
 
 
@@ -278,6 +292,17 @@ def test_a_broken_case_is_one_line_and_exit_code_two(tmp_path, capsys, name):
         assert fragment in told.err
     assert "Traceback" not in told.err
     assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", ["NaN", "empty cells", "infinite", "gap"])
+def test_holes_are_masked_where_that_is_asked_for(tmp_path, capsys, name):
+    folder = broken(tmp_path, BROKEN[name][0])
+    assert main(["check", str(folder), "--mask"]) == 0
+    told = capsys.readouterr()
+    assert told.err == ""
+    warnings = [line for line in told.out.splitlines() if line.startswith("warning")]
+    assert len(warnings) == 1
+    assert "masked there" in warnings[0] or "no window is compared across it" in warnings[0]
 
 
 def latin(folder):
@@ -413,15 +438,13 @@ def test_a_file_that_cannot_be_read_is_one_line(tmp_path, capsys, spoil, fragmen
 
 
 DOUBTFUL = {
-    "NaN": ({"run1": csv(qpos=put(30, "nan"))}, ["run1.csv, row 31 (line 32): joint/hinge/qpos is empty or NaN"]),
-    "empty cells": (
-        {"run1": csv(qvel=lambda v: put(slice(10, 14), "")(v))},
-        ["run1.csv, row 11", "joint/hinge/qvel is empty or NaN in 4 of 400 rows", "masked there"],
+    "short gap": (
+        {"run1": csv(time=lambda t: np.where(t >= 2, t + 0.2, t))},
+        ["run1.csv, row 201 (line 202): gap of 0.21 s from 1.99 to 2.2 s", "no window is compared across it"],
     ),
-    "infinite": ({"run1": csv(qpos=put(30, "inf"))}, ["run1.csv, row 31", "joint/hinge/qpos is not finite"]),
-    "gap": (
-        {"run1": csv(time=lambda t: np.where(t >= 2, t + 1, t))},
-        ["run1.csv, row 201 (line 202): gap of 1.01 s from 1.99 to 3 s", "no window is compared across it"],
+    "a slower log": (
+        {"run1": csv(qvel=lambda v: np.where(np.arange(len(v)) % 2, "", v.astype(str)))},
+        ["run1.csv, row 2", "joint/hinge/qvel is empty or NaN in 200 of 400 rows", "masked there"],
     ),
     "unknown column": (
         {"run1": csv(temperature=lambda t: 20 + t)},

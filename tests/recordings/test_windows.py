@@ -17,7 +17,7 @@ def loaded(tmp_path, *changes, **recordings):
     data = columns()
     for name, rows, value in changes:
         data[name][rows] = value
-    return load_case(write_case(tmp_path, **(recordings or {"run1": data})))
+    return load_case(write_case(tmp_path, **(recordings or {"run1": data})), mask=True)
 
 
 def one(tmp_path, *changes):
@@ -125,14 +125,14 @@ def test_windows_may_overlap(tmp_path):
 def test_a_wrapped_angle_is_made_continuous(tmp_path):
     data = columns()
     data[QPOS] = (data[QPOS] + 2.5 + np.pi) % (2 * np.pi) - np.pi
-    (recording,) = load_case(write_case(tmp_path, run1=data)).check().recordings
+    (recording,) = load_case(write_case(tmp_path, run1=data), mask=True).check().recordings
     np.testing.assert_allclose(np.diff(recording.qpos[:, 0]), np.diff(columns()[QPOS]), atol=1e-12)
 
 
 def test_a_fast_joint_does_not_wrap(tmp_path):
     data = columns()
     data[QPOS] = np.cumsum(np.full(400, 6.2))  # more than the simulator's joint does, but no turn that is lost
-    (recording,) = load_case(write_case(tmp_path, run1=data)).recordings
+    (recording,) = load_case(write_case(tmp_path, run1=data), mask=True).recordings
     np.testing.assert_array_equal(recording.qpos[:, 0], data[QPOS])
 
 
@@ -146,7 +146,7 @@ def test_resampling_moves_measurements_and_keeps_the_impulse(tmp_path):
     data = columns()
     data["time"][200:] += 1.0
     data[QPOS][10] = np.nan
-    (recording,) = load_case(write_case(tmp_path, run1=data)).recordings
+    (recording,) = load_case(write_case(tmp_path, run1=data), mask=True).recordings
     uniform = resample(recording, 0.025)
     steps = np.diff(uniform.time)
     np.testing.assert_allclose(steps[uniform.valid], 0.025)
@@ -168,7 +168,7 @@ def test_noise_of_jittered_recordings_stays_white_on_a_grid(tmp_path):
     data["time"] = data["time"] + 0.3 * dt * rng.uniform(-0.5, 0.5, 4000)
     noise = 0.01 * rng.standard_normal(4000)
     data[QPOS] = np.sin(3.0 * data["time"]) + noise
-    (recording,) = load_case(write_case(tmp_path, run1=data)).recordings
+    (recording,) = load_case(write_case(tmp_path, run1=data), mask=True).recordings
     uniform = resample(recording, dt)
     left = uniform.qpos[:, 0] - np.sin(3.0 * uniform.time)
     left = left[uniform.qpos_measured[:, 0]]
