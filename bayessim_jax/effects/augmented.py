@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -131,11 +131,13 @@ class AugmentedMjcf:
         first = jnp.zeros(self.actions.size, kind) if action is None else jnp.asarray(action, kind)
         held = first if past is None or not len(past) else jnp.asarray(past[0], kind)
         time = jnp.asarray(time, kind)
-        if any(w.effect.remembers for _, w in self._at("sense")):
+        late = [w for _, w in self._senses() if w.effect.remembers]
+        bent = [w for _, w in self._senses() if not w.effect.remembers]
+        still = jnp.zeros_like(qvel)
+        qpos, qvel = self._restore(bent, theta, qpos, qvel, time, still, still)
+        if late:
             seen = AugmentedState(MjcfState(self.engine.init(inner, qpos, qvel), held), (), (), time)
-            qpos, qvel = self._restore(theta, qpos, qvel, time, *self._curve(inner, seen, held))
-        else:
-            qpos, qvel = self._restore(theta, qpos, qvel, time, jnp.zeros_like(qvel), jnp.zeros_like(qvel))
+            qpos, qvel = self._restore(late, theta, qpos, qvel, time, *self._curve(inner, seen, held))
         physics = self.engine.init(inner, qpos, qvel)
         inertias = {
             joint: share * probe_inertia(self.engine, inner, self.base.qpos.astype(kind), self._dof(joint))
@@ -189,7 +191,7 @@ class AugmentedMjcf:
         """The channels in their order, as the sensors' effects show them."""
         _, inner = self._prepare(theta)
         seen = replace(self.base, engine=self.engine).observe(inner, state.base)
-        for k, w in self._at("sense"):
+        for k, w in self._senses():
             for c in self._channels_of(w):
                 seen = seen.at[c].set(
                     w.effect.sense(w.values(theta), state.memories[k], seen[c], Moment(state.time, self.dt))
@@ -213,6 +215,10 @@ class AugmentedMjcf:
 
     def _at(self, port: str) -> list[tuple[int, Wired]]:
         return [(k, w) for k, w in enumerate(self.effects) if w.effect.port == port]
+
+    def _senses(self) -> list[tuple[int, Wired]]:
+        """Effects on readings in the order in which they act: first those that show another moment of the motion."""
+        return sorted(self._at("sense"), key=lambda item: not item[1].effect.remembers)
 
     def _dof(self, joint: int) -> int:
         return int(self.engine.model.jnt_dofadr[joint])
@@ -455,6 +461,7 @@ class AugmentedMjcf:
 
     def _restore(
         self,
+        wired: Sequence[Wired],
         theta: Float[Array, " d"],
         qpos: Float[Array, " nq"],
         qvel: Float[Array, " nv"],
@@ -462,9 +469,9 @@ class AugmentedMjcf:
         acceleration: Float[Array, " nv"],
         jerk: Float[Array, " nv"],
     ) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
-        """The state that these positions and velocities were measured in."""
+        """The positions and velocities behind these, which some effects on readings show, the last one outermost."""
         seen = {c.name for c in self.channels}
-        for _, w in self._at("sense"):
+        for w in reversed(wired):
             if w.site.joint < 0:
                 continue
             q, v = int(self.engine.model.jnt_qposadr[w.site.joint]), self._dof(w.site.joint)

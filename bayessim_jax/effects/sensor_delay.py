@@ -50,7 +50,7 @@ class SensorDelay(SenseEffect):
         return ((moment.position, moment.velocity), *memory[:-1])
 
     def sense(self, values: Values, memory: Memory, reading: Scalar, moment: Moment) -> Scalar:
-        """The position T ago."""
+        """The position T ago, and what the reading is off by now."""
         period, back = moment.h, len(memory) - 1
         steps = jnp.clip(values["seconds"] / period, 0.0, float(back))
         whole = jnp.minimum(jnp.floor(steps), back - 1.0)
@@ -58,7 +58,8 @@ class SensorDelay(SenseEffect):
         near, far = _pick(memory, whole), _pick(memory, whole + 1.0)
         rise = near[0] - far[0]
         bend = rise - period * far[1], period * near[1] - rise
-        return near[0] - f * (rise + (1.0 - f) * ((1.0 - f) * bend[1] + f * bend[0]))
+        late = near[0] - f * (rise + (1.0 - f) * ((1.0 - f) * bend[1] + f * bend[0]))
+        return late + (reading - memory[0][0])
 
     def restore(self, values: Values, moment: Moment) -> tuple[Number, Number]:
         """Where it is T after it was there."""

@@ -194,6 +194,39 @@ def test_effects_compose_in_their_order():
     np.testing.assert_allclose(runs[1], other, atol=1e-5)
 
 
+@pytest.mark.parametrize("port", ["sense", pytest.param("", marks=pytest.mark.slow)])
+def test_companions_that_are_neutral_change_nothing(port, in_float64):
+    """One simulator with every effect in it is each of them in turn."""
+    base = system(*MODELS["pendulum"])
+    names = [n for n in ON_ARM if TABLE[n][0].startswith(port) and effect_places(EFFECTS[n], base)]
+    pairs = [(EFFECTS[n], effect_places(EFFECTS[n], base)[n == "soft_stop"]) for n in names]
+    scales = {place: scales_of(base, place) for _, place in pairs}
+    union = with_effects(base, pairs, scales)
+    first = np.cumsum([0, *(len(w.parameters) for w in union.effects)])
+    every = observe_all(union, steps=60)
+    for k, pair in enumerate(pairs):
+        alone = with_effects(base, [pair], scales)
+        own = np.asarray(start_of(alone))[1:] * (1.3 if names[k] == "sensor_scale" else 1.0)
+        values = np.asarray(neutral_of(union)).copy()
+        values[1 + first[k] : 1 + first[k + 1]] = own
+        found, expected = every(jnp.asarray(values)), observe_all(alone, steps=60)(jnp.array([0.5, *own]))
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12, err_msg=names[k])
+
+
+def test_readings_are_restored_in_the_reverse_of_their_order(in_float64):
+    """A window begins where the sensors show what was recorded, whatever acts on them together."""
+    base = system(*MODELS["pendulum"])
+    place = "joint/hinge/qpos"
+    names = ("sensor_offset", "sensor_scale", "sensor_delay")
+    values = {"sensor_offset": 0.05, "sensor_scale": 1.3, "sensor_delay": 0.013}
+    for order in itertools.permutations(names):
+        augmented = with_effects(base, [(EFFECTS[n], place) for n in order], Scales(period=0.01))
+        theta = jnp.array([0.5, *(values[n] for n in order)])
+        state = augmented.begin(theta, jnp.array([0.3]), jnp.array([-0.5]))
+        shown = augmented.observe(theta, state)
+        np.testing.assert_allclose(shown[0], 0.3, atol=2e-4, err_msg=str(order))
+
+
 def test_names_units_and_ranges_are_in_the_box():
     base = system(*MODELS["arm"])
     places = [("stribeck_friction", "joint/elbow"), ("actuator_delay", "actuator/m0")]
