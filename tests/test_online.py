@@ -19,6 +19,13 @@ from bayessim_jax.systems import Balance, CartPole, Pendulum, SkidSteer, Upswing
 
 TINY = MixtureDensity(Lstm(8, frame=4), MixtureHead(2, 8), Schedule(epochs=10, draws=32, batch=16), members=1, folds=4)
 
+OPTIONS = online.COMPILER_OPTIONS | {"xla_cpu_use_fusion_emitters": True}
+"""What is equal bit for bit is compiled as users compile it, and not as quickly as the rest of the quick tests."""
+
+
+def compiled(function, **static):
+    return jax.jit(function, compiler_options=OPTIONS, **static)
+
 
 @pytest.fixture(scope="module")
 def cartpole():
@@ -42,7 +49,7 @@ def cartpole():
 
 @pytest.fixture(scope="module")
 def run():
-    return jax.jit(online.run, static_argnames="rounds")
+    return compiled(online.run, static_argnames="rounds")
 
 
 def _same(a, b):
@@ -53,7 +60,7 @@ def _same(a, b):
 def _check_that_cuts_change_nothing(setup, target, run):
     key = jax.random.key(3)
     keys = online.split(key)
-    start = jax.jit(online.init)(keys.init, setup)
+    start = compiled(online.init)(keys.init, setup)
     whole, infos = run(key, setup, target, start, rounds=4)
     assert int(whole.round) == 4
 
@@ -64,7 +71,7 @@ def _check_that_cuts_change_nothing(setup, target, run):
     assert _same(whole, state)
     assert _same(infos, jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *chunks))
 
-    state, record, update = start, jax.jit(online.record), jax.jit(online.update)
+    state, record, update = start, compiled(online.record), compiled(online.update)
     for _ in range(4):
         state, _ = update(keys.update, setup, state, record(keys.record, setup, target, state))
     assert _same(whole, state)
@@ -79,7 +86,7 @@ def test_cuts_change_nothing_where_only_some_rounds_infer(cartpole, run, warmup,
     setup, target = cartpole
     setup, key = setup.replace(warmup=warmup, inferences=inferences), jax.random.key(3)
     keys = online.split(key)
-    start = jax.jit(online.init)(keys.init, setup)
+    start = compiled(online.init)(keys.init, setup)
     whole, infos = run(key, setup, target, start, rounds=4)
     inferred = jnp.array([warmup <= r < warmup + inferences for r in range(4)])
     assert (jnp.isfinite(infos.fit.log_q_validation) == inferred).all()
@@ -92,12 +99,12 @@ def test_cuts_change_nothing_where_only_some_rounds_infer(cartpole, run, warmup,
     assert jnp.isfinite(infos.return_target).all()
     assert whole.pool.filled.sum() == min(inferences, 2)
 
-    state, record = start, jax.jit(online.record)
+    state, record, update, improve = start, *map(compiled, (online.record, online.update, online.improve))
     for r in range(4):
         if online.infers(setup, r):
-            state, _ = jax.jit(online.update)(keys.update, setup, state, record(keys.record, setup, target, state))
+            state, _ = update(keys.update, setup, state, record(keys.record, setup, target, state))
         else:
-            state, _ = jax.jit(online.improve)(keys.update, setup, state)
+            state, _ = improve(keys.update, setup, state)
     assert _same(whole.learner, state.learner)
 
 
