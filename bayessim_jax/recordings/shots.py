@@ -31,17 +31,19 @@ __all__ = [
     "CaseModel",
     "StepError",
     "case_model",
+    "lagrange",
     "margin_of",
     "margins_of",
     "predictor",
     "split_windows",
     "take",
+    "tame",
 ]
 
 REFINED = 4
 """Time steps of a finer simulation in one of the model's own."""
-WILD = 10.0
-"""Times a usual window's error of the time step: larger ones are not of first order."""
+WILD = 0.1
+"""Of a channel's spread: a larger error of the time step is not one that can be interpolated."""
 JITTER = 0.02
 """Share of a step by which rows may lie off a uniform grid before a recording is put on one."""
 
@@ -166,28 +168,50 @@ class CaseModel:
 
 @dataclass(frozen=True, eq=False)
 class StepError:
-    """What the time step h of a simulation does to predictions, at one z; the time step of recordings is s h."""
+    """What the time step of a simulation does to predictions, at one z: simulations of several steps, interpolated.
 
-    coarse: CaseModel
-    finer: CaseModel
-    """With h/4."""
+    With steps s_k h and predictions y_k, that of a step s h is y(s) = Σ_k L_k(s) y_k, L_k Lagrange's polynomials.
+    """
+
+    models: tuple[CaseModel, ...]
     z: Float[Array, " d"]
     ratio: float = 0.0
     """The s of what was recorded: 0 for a machine."""
 
-    def drift(
-        self, shots: Shots, delta: Float[Array, "windows n"] | None = None
-    ) -> Float[np.ndarray, "windows rows obs"]:
-        """y(0) − y(h) to first order, zero where nothing was measured and where it is not of first order."""
-        coarse, fine = (predict_windows(predictor(m), shots, self.z, delta) for m in (self.coarse, self.finer))
-        found = (fine - coarse) / (1 - 1 / REFINED)
-        found = np.where(np.asarray(shots.measured) & np.isfinite(found), found, 0.0)
-        size = np.sqrt((found**2).mean(1, keepdims=True))
-        return np.where(size <= WILD * np.median(size, axis=0), found, 0.0)
+    @property
+    def nodes(self) -> tuple[float, ...]:
+        """Each s_k."""
+        return tuple(1 / model.refined for model in self.models)
+
+    def runs(
+        self, shots: Shots, refined: int, delta: Float[Array, "windows n"] | None = None
+    ) -> Float[np.ndarray, "windows nodes rows obs"]:
+        """Predictions y_k less those with h / `refined`; zero where nothing was measured."""
+        each = [predict_windows(predictor(m), shots, self.z, delta) for m in self.models]
+        found = np.stack([y - each[self.nodes.index(1 / refined)] for y in each], axis=1)
+        there = np.asarray(shots.measured) & np.isfinite(found).all(1)
+        return np.where(there[:, None], found, 0.0)
 
     def offset(self, shots: Shots, refined: int) -> Float[np.ndarray, "windows rows obs"]:
         """What has to be added to predictions of a simulation with h / `refined`."""
-        return (1 / refined - self.ratio) * self.drift(shots)
+        runs = tame(self.runs(shots, refined), shots)
+        return np.einsum("k,wkro->wro", lagrange(self.nodes, self.ratio), runs)
+
+
+def tame(
+    runs: Float[np.ndarray, "windows nodes rows obs"], shots: Shots
+) -> Float[np.ndarray, "windows nodes rows obs"]:
+    """The same with zero for windows and channels in which errors are too large to be interpolated."""
+    measured = np.asarray(shots.measured)
+    spread = np.nanstd(np.where(measured, np.asarray(shots.y), np.nan), axis=(0, 1))
+    size = np.sqrt((runs**2).mean(2, keepdims=True)).max(1, keepdims=True)
+    return np.where(size <= WILD * np.nan_to_num(spread), runs, 0.0)
+
+
+def lagrange(nodes: Sequence[float], at: Any) -> Any:
+    """Lagrange's polynomials of some nodes, at one place."""
+    parts = [[(at - b) / (a - b) for b in nodes if b != a] for a in nodes]
+    return jnp.stack([jnp.asarray(math.prod(part)) for part in parts])
 
 
 def _coast(model: CaseModel, qpos: np.ndarray, moves: np.ndarray) -> np.ndarray:

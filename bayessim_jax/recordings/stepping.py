@@ -1,14 +1,12 @@
 """The error of the simulation's time step: measured, taken out of predictions, and inferred as far as it is uncertain.
 
-Simulators of first order predict y(h) = y(0) + c h + O(h²) with a time step h. A machine takes no steps, but recordings
-may be another simulator's, with a step s times the model's own: what they hold is y(s h), s between 0 and 1. From
-simulations with h and with h/4,
+Simulators predict y(h) = y(0) + c h + O(h²) with a time step h. A machine takes no steps, but recordings may be another
+simulator's, with a step s times the model's own: what they hold is y(s h), s between 0 and 1. Simulations with h and
+h/4, and with h/16 where the error is large, give y as a function of s by interpolation.
 
-    D = (4/3) (y(h/4) − y(h)) ≈ y(0) − y(h)    and    y(s h) ≈ y(h) + (1 − s) D ≈ y(h/4) + (1/4 − s) D.
-
-An average over thousands of rows shows errors far below the noise of one. So D is computed once, at a first fit, and
-s is inferred with θ, s ~ N(1/3, (1/3)²): posteriors are neither moved by an error that is known, nor too narrow where
-the recordings do not tell θ and s apart. Where D is not small against the noise, the finer simulation is used.
+An average over thousands of rows shows errors far below the noise of one. So s is inferred with θ, s ~ N(1/3, (1/3)²):
+posteriors are neither moved by an error that is known, nor too narrow where the recordings do not tell θ and s apart.
+What the steps do is computed once, at a first fit. Where it is not small against the noise, h/4 is simulated with.
 
 Source: Richardson 1911 (extrapolation to the limit); Kennedy and O'Hagan 2001 (a simulator's own error as an unknown)
 """
@@ -29,7 +27,7 @@ from bayessim_jax.diagnosis.whiteness import difference_noise
 from bayessim_jax.inference.direct import fit_direct, noise_floor
 from bayessim_jax.inference.replay import Inputs, Restarted
 from bayessim_jax.inference.shooting import Fit, Predict, Shots
-from bayessim_jax.recordings.shots import REFINED, CaseModel, StepError, case_model, predictor
+from bayessim_jax.recordings.shots import REFINED, CaseModel, StepError, case_model, lagrange, predictor, tame
 from bayessim_jax.recordings.windows import Windows
 
 __all__ = ["Settled", "settle_step"]
@@ -38,21 +36,18 @@ TOLERABLE = 1.0
 """Of the noise: with a larger error of the time step the finer simulation is the one that is used."""
 INVISIBLE = 0.2
 """Of the noise of an average over all rows: a smaller error changes no posterior."""
-SURE = 0.1
-"""Of D that is uncertain at least: what of it is not of first order."""
+SURE = 0.25
+"""Of s that is uncertain at least, for what interpolation does not hold."""
 RATIO = normal(1 / 3, 1 / 3)
 """What is believed of s."""
 
 
 @struct.dataclass
 class Stepped:
-    """A window, and what the time step does to its prediction."""
+    """A window, and predictions with several time steps less the one that is simulated."""
 
     window: Inputs
-    own: Float[Array, ""]
-    """The simulation's time step over the model's own."""
-    drift: Float[Array, "rows obs"]
-    """D."""
+    runs: Float[Array, "nodes rows obs"]
 
 
 @dataclass(frozen=True)
@@ -76,33 +71,41 @@ def settle_step(
 ) -> Settled:
     """Fit a case and the time step of what was recorded, with a finer simulation where the model's is too coarse.
 
-    The finer simulation is used where D is not small against the sensors' noise, unless the recordings are explained
-    less well by it.
+    The finer simulation is used where the error is not small against the sensors' noise, unless the recordings are
+    explained less well by it.
     """
     margins = model.margins + Margins.create(["time step"], [RATIO])
     shots = model.shots(windows)
-    nothing = np.zeros(shots.y.shape)
-    predict, first = _stepped(predictor(model)), _with_drift(shots, model, nothing)
+    nodes = (1.0, 1 / REFINED)
+    predict = _stepped(predictor(model), nodes)
+    first = _with_runs(shots, np.zeros((len(shots.y), len(nodes), *shots.y.shape[1:])))
     fit = fit_direct(key, predict, first, margins.size, step=model.step, say=say)
     if isinstance(model.system, Restarted):
-        return Settled(model, fit, predict, first, margins, nothing)
-    finer = case_model(model.case, engine=model.engine_name, before=model.before, refined=REFINED)
-    error = StepError(model, finer, fit.z[:-1])
-    drift = error.drift(shots, fit.delta)
-    size, counts = _size(shots, fit, drift)
+        return Settled(model, fit, predict, first, margins, np.zeros(shots.y.shape))
+    finer, finest = (
+        case_model(model.case, engine=model.engine_name, before=model.before, refined=REFINED**k) for k in (1, 2)
+    )
+    error = StepError((model, finer), fit.z[:-1])
+    runs = error.runs(shots, 1, fit.delta)
+    limit = _between(nodes, 0.0, runs)
+    size, counts = _size(shots, fit, limit)
     if size * np.sqrt(counts) < INVISIBLE:
-        return Settled(model, fit, predict, first, margins, SURE * drift)
+        return Settled(model, fit, predict, first, margins, SURE * limit)
 
-    def refit(base: CaseModel) -> Settled:
-        predict, seen = _stepped(predictor(base)), _with_drift(shots, base, drift)
+    def refit(base: CaseModel, predict: Predict, error: StepError, runs: np.ndarray) -> Settled:
+        calm = tame(runs, shots)
+        seen = _with_runs(shots, calm)
         found = fit_direct(key, predict, seen, margins.size, start=fit, step=base.step, say=say)
         ratio = float(np.clip(RATIO.value(found.z[-1]), 0.0, 1.0))
         sd = RATIO.b * float(np.sqrt(np.linalg.inv(np.asarray(found.precision))[-1, -1]))
+        ahead, behind = (_between(error.nodes, ratio + step, calm) for step in (1e-3, -1e-3))
+        wild = (calm == 0.0).all(1) * np.abs(runs).max(1)
         base = dataclasses.replace(base, step_error=dataclasses.replace(error, z=found.z[:-1], ratio=ratio))
-        return Settled(base, found, predict, seen, margins, max(sd, SURE) * drift)
+        return Settled(base, found, predict, seen, margins, max(sd, SURE) * (ahead - behind) / 2e-3 + wild)
 
     if size > TOLERABLE:
-        again = refit(finer)
+        wide = StepError((model, finer, finest), fit.z[:-1])
+        again = refit(finer, _stepped(predictor(finer), wide.nodes), wide, wide.runs(shots, REFINED, fit.delta))
         if float((np.log(np.asarray(fit.sigma) / np.asarray(again.fit.sigma))).mean()) > -0.01:
             h = model.system.dt / model.system.substeps
             times = f"the integration error is {size:.1f} times the noise"
@@ -110,26 +113,31 @@ def settle_step(
             say(remark)
             told = dataclasses.replace(again.model, remarks=(*again.model.remarks, remark))
             return dataclasses.replace(again, model=told)
-    return refit(model)
+    return refit(model, predict, error, runs)
 
 
-def _stepped(predict: Predict) -> Predict:
+def _stepped(predict: Predict, nodes: tuple[float, ...]) -> Predict:
     """Predictions with the time step of what was recorded."""
 
     def stepped(z: Array, delta: Array, seen: Stepped) -> Array:
-        return predict(z[:-1], delta, seen.window) + (seen.own - RATIO.value(z[-1])) * seen.drift
+        return predict(z[:-1], delta, seen.window) + jnp.tensordot(lagrange(nodes, RATIO.value(z[-1])), seen.runs, 1)
 
     return stepped
 
 
-def _with_drift(shots: Shots, model: CaseModel, drift: Float[np.ndarray, "windows rows obs"]) -> Shots:
-    own = jnp.full(drift.shape[0], 1.0 / model.refined)
-    return dataclasses.replace(shots, inputs=Stepped(shots.inputs, own, jnp.asarray(drift)))
+def _with_runs(shots: Shots, runs: Float[np.ndarray, "windows nodes rows obs"]) -> Shots:
+    return dataclasses.replace(shots, inputs=Stepped(shots.inputs, jnp.asarray(runs)))
 
 
-def _size(shots: Shots, fit: Fit, drift: Float[np.ndarray, "windows rows obs"]) -> tuple[float, int]:
-    """D of a usual window against the noise, in the channel where it is largest, and the numbers measured."""
+def _between(
+    nodes: tuple[float, ...], ratio: float, runs: Float[np.ndarray, "windows nodes rows obs"]
+) -> Float[np.ndarray, "windows rows obs"]:
+    return np.einsum("k,wkro->wro", lagrange(nodes, ratio), runs)
+
+
+def _size(shots: Shots, fit: Fit, error: Float[np.ndarray, "windows rows obs"]) -> tuple[float, int]:
+    """An error against the noise, in the channel where it is largest, and the numbers measured."""
     measured = np.asarray(shots.measured)
     noise = difference_noise(np.nan_to_num(np.asarray(fit.misses)), measured)
-    usual = np.sqrt(np.median((drift**2).sum(1) / np.maximum(measured.sum(1), 1), axis=0))
+    usual = np.sqrt((error**2).sum((0, 1)) / np.maximum(measured.sum((0, 1)), 1))
     return float((usual / np.maximum(noise, np.asarray(noise_floor(shots)))).max()), int(measured.sum())

@@ -230,7 +230,7 @@ def test_readings_are_restored_in_the_reverse_of_their_order(in_float64):
         theta = jnp.array([0.5, *(values[n] for n in order)])
         state = augmented.begin(theta, jnp.array([0.3]), jnp.array([-0.5]))
         shown = augmented.observe(theta, state)
-        np.testing.assert_allclose(shown[0], 0.3, atol=2e-4, err_msg=str(order))
+        np.testing.assert_allclose(shown[0], 0.3, atol=3e-3, err_msg=str(order))
 
 
 def test_names_units_and_ranges_are_in_the_box():

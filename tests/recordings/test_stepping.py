@@ -9,7 +9,7 @@ import pytest
 
 from bayessim_jax.inference.direct import fit_direct
 from bayessim_jax.recordings.loading import load_case
-from bayessim_jax.recordings.shots import StepError, case_model, predictor, split_windows
+from bayessim_jax.recordings.shots import StepError, case_model, lagrange, predictor, split_windows
 from bayessim_jax.recordings.stepping import RATIO, settle_step
 from benchmarks.worlds import STEP, make_case
 
@@ -36,7 +36,7 @@ def test_the_error_of_a_constant_push_is_the_one_in_closed_form(coasting):
     finer = case_model(coasting.case, refined=4)
     z, command = jnp.array([0.3]), 2.0
     windows = constant(split_windows(coasting)[0], command)
-    drift = StepError(coasting, finer, z).drift(coasting.shots(windows))
+    drift = StepError((coasting, finer), z).offset(coasting.shots(windows), 1)
     mass = float(coasting.margins.theta(z)[0])
     gear = float(coasting.compiled.actuator_gear[0, 0])
     damping = float(coasting.compiled.dof_damping[0])
@@ -50,12 +50,21 @@ def test_the_error_of_a_constant_push_is_the_one_in_closed_form(coasting):
 def test_recordings_are_freed_of_the_error_of_the_step_that_is_taken(coasting):
     finer = case_model(coasting.case, refined=4)
     windows = split_windows(coasting)[0]
-    error = StepError(coasting, finer, jnp.array([0.3]), ratio=0.1)
-    raw, drift = np.asarray(coasting.shots(windows).y), error.drift(coasting.shots(windows))
+    finest = case_model(coasting.case, refined=16)
+    error = StepError((coasting, finer, finest), jnp.array([0.3]), ratio=0.1)
+    limit = dataclasses.replace(error, ratio=0.0).offset(coasting.shots(windows), 1)
+    raw = np.asarray(coasting.shots(windows).y)
     for model, own in ((coasting, 1.0), (finer, 0.25)):
         freed = dataclasses.replace(model, step_error=error).shots(windows)
-        np.testing.assert_allclose(raw - np.asarray(freed.y), (own - 0.1) * drift, atol=1e-12)
-    assert np.abs(drift).max() > 1e-6
+        np.testing.assert_allclose(raw - np.asarray(freed.y), (own - 0.1) * limit, atol=1e-9)
+    assert np.abs(limit).max() > 1e-6
+
+
+def test_interpolation_is_exact_at_its_nodes_and_for_polynomials():
+    nodes = (1.0, 0.25, 0.0625)
+    np.testing.assert_allclose(np.stack([lagrange(nodes, s) for s in nodes]), np.eye(3), atol=1e-12)
+    values = np.array([2 - 3 * s + 5 * s**2 for s in nodes])
+    np.testing.assert_allclose(lagrange(nodes, 0.0) @ values, 2.0, rtol=1e-9)
 
 
 @pytest.mark.parametrize("finer", [0.5, 16.0])
