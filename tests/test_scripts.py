@@ -89,3 +89,12 @@ def test_the_tables_of_the_docs_are_printed_from_the_records(script, words, page
     rows = [line for line in printed.replace("\r", "\n").splitlines() if line.startswith("| ")]
     assert len(rows) > 1
     assert [row for row in rows if row not in docs] == []
+
+
+@pytest.mark.slow
+def test_a_tutorial_writes_its_page_and_report(tmp_path):
+    run("tutorials.py", "--only", "clean", "--docs", tmp_path)
+    page = (tmp_path / "tutorials.md").read_text(encoding="utf-8")
+    assert "| verdict | | `no_mismatch` |" in page
+    assert "bayessim conceal docs/examples/pendulum/pendulum.xml --seed 1 --out clean" in page
+    assert (tmp_path / "tutorials" / "clean.html").stat().st_size > 100_000
