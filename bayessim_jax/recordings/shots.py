@@ -31,6 +31,7 @@ __all__ = [
     "CaseModel",
     "StepError",
     "case_model",
+    "interpolate",
     "lagrange",
     "margin_of",
     "margins_of",
@@ -194,8 +195,14 @@ class StepError:
 
     def offset(self, shots: Shots, refined: int) -> Float[np.ndarray, "windows rows obs"]:
         """What has to be added to predictions of a simulation with h / `refined`."""
-        runs = tame(self.runs(shots, refined), shots)
-        return np.einsum("k,wkro->wro", lagrange(self.nodes, self.ratio), runs)
+        return interpolate(self.nodes, self.ratio, tame(self.runs(shots, refined), shots))
+
+
+def interpolate(
+    nodes: Sequence[float], ratio: float, runs: Float[np.ndarray, "windows nodes rows obs"]
+) -> Float[np.ndarray, "windows rows obs"]:
+    """Predictions with a step s h, from those with the steps of some nodes."""
+    return np.einsum("k,wkro->wro", lagrange(nodes, ratio), runs)
 
 
 def tame(

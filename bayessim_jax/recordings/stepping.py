@@ -27,7 +27,16 @@ from bayessim_jax.diagnosis.whiteness import difference_noise
 from bayessim_jax.inference.direct import fit_direct, noise_floor
 from bayessim_jax.inference.replay import Inputs, Restarted
 from bayessim_jax.inference.shooting import Fit, Predict, Shots
-from bayessim_jax.recordings.shots import REFINED, CaseModel, StepError, case_model, lagrange, predictor, tame
+from bayessim_jax.recordings.shots import (
+    REFINED,
+    CaseModel,
+    StepError,
+    case_model,
+    interpolate,
+    lagrange,
+    predictor,
+    tame,
+)
 from bayessim_jax.recordings.windows import Windows
 
 __all__ = ["Settled", "settle_step"]
@@ -82,12 +91,10 @@ def settle_step(
     fit = fit_direct(key, predict, first, margins.size, step=model.step, say=say)
     if isinstance(model.system, Restarted):
         return Settled(model, fit, predict, first, margins, np.zeros(shots.y.shape))
-    finer, finest = (
-        case_model(model.case, engine=model.engine_name, before=model.before, refined=REFINED**k) for k in (1, 2)
-    )
+    finer = case_model(model.case, engine=model.engine_name, before=model.before, refined=REFINED)
     error = StepError((model, finer), fit.z[:-1])
     runs = error.runs(shots, 1, fit.delta)
-    limit = _between(nodes, 0.0, runs)
+    limit = interpolate(nodes, 0.0, runs)
     size, counts = _size(shots, fit, limit)
     if size * np.sqrt(counts) < INVISIBLE:
         return Settled(model, fit, predict, first, margins, SURE * limit)
@@ -98,12 +105,13 @@ def settle_step(
         found = fit_direct(key, predict, seen, margins.size, start=fit, step=base.step, say=say)
         ratio = float(np.clip(RATIO.value(found.z[-1]), 0.0, 1.0))
         sd = RATIO.b * float(np.sqrt(np.linalg.inv(np.asarray(found.precision))[-1, -1]))
-        ahead, behind = (_between(error.nodes, ratio + step, calm) for step in (1e-3, -1e-3))
+        ahead, behind = (interpolate(error.nodes, ratio + step, calm) for step in (1e-3, -1e-3))
         wild = (calm == 0.0).all(1) * np.abs(runs).max(1)
         base = dataclasses.replace(base, step_error=dataclasses.replace(error, z=found.z[:-1], ratio=ratio))
         return Settled(base, found, predict, seen, margins, max(sd, SURE) * (ahead - behind) / 2e-3 + wild)
 
     if size > TOLERABLE:
+        finest = case_model(model.case, engine=model.engine_name, before=model.before, refined=REFINED**2)
         wide = StepError((model, finer, finest), fit.z[:-1])
         again = refit(finer, _stepped(predictor(finer), wide.nodes), wide, wide.runs(shots, REFINED, fit.delta))
         if float((np.log(np.asarray(fit.sigma) / np.asarray(again.fit.sigma))).mean()) > -0.01:
@@ -127,12 +135,6 @@ def _stepped(predict: Predict, nodes: tuple[float, ...]) -> Predict:
 
 def _with_runs(shots: Shots, runs: Float[np.ndarray, "windows nodes rows obs"]) -> Shots:
     return dataclasses.replace(shots, inputs=Stepped(shots.inputs, jnp.asarray(runs)))
-
-
-def _between(
-    nodes: tuple[float, ...], ratio: float, runs: Float[np.ndarray, "windows nodes rows obs"]
-) -> Float[np.ndarray, "windows rows obs"]:
-    return np.einsum("k,wkro->wro", lagrange(nodes, ratio), runs)
 
 
 def _size(shots: Shots, fit: Fit, error: Float[np.ndarray, "windows rows obs"]) -> tuple[float, int]:
