@@ -1,5 +1,6 @@
 """Machines with something concealed in them: laws of physics that a model lacks, and motions that show them."""
 
+from bayessim_jax.concealment.law import ModelLaw
 from bayessim_jax.concealment.motions import KINDS
 from bayessim_jax.concealment.registry import LAWS, UNKNOWN, choose_place, lookup_law
 from bayessim_jax.concealment.scene import Scene, make_scene
@@ -11,6 +12,7 @@ __all__ = [
     "LAWS",
     "UNKNOWN",
     "Hidden",
+    "ModelLaw",
     "RunawayError",
     "Scene",
     "StrengthError",

@@ -165,8 +165,8 @@ def restore_readings(
     velocity: Float[Array, "windows rows"],
     acceleration: Float[Array, "windows rows"],
     jerk: Float[Array, "windows rows"],
-) -> tuple[Array, Array, Array, Array]:
-    """True positions and velocities behind readings of a `SenseEffect`, ∂q/∂x, and ∂q/∂reading."""
+) -> tuple[Array, Array, Array, Array, Array]:
+    """True positions and velocities behind readings of a `SenseEffect`, ∂q/∂x, ∂v/∂x, and ∂q/∂reading."""
 
     def restore(x: Array, position: Array) -> tuple[Array, Array]:
         moment = Moment(time, period, position, velocity, acceleration, jerk=jerk)
@@ -174,8 +174,8 @@ def restore_readings(
         return q * jnp.ones_like(time), v * jnp.ones_like(time)
 
     (q, v), slope = jax.jvp(lambda position: restore(x, position), (position,), (jnp.ones_like(position),))
-    along = jax.vmap(lambda d: jax.jvp(lambda x: restore(x, position)[0], (x,), (d,))[1])(jnp.eye(x.size))
-    return q, v, jnp.moveaxis(along, 0, -1), slope[0]
+    along = jax.vmap(lambda d: jax.jvp(lambda x: restore(x, position), (x,), (d,))[1], out_axes=-1)(jnp.eye(x.size))
+    return q, v, *along, slope[0]
 
 
 def _with_slopes(f: Any, x: Array) -> tuple[Array, Array]:

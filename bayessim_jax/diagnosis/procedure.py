@@ -48,6 +48,10 @@ FINISHED = 14
 """Single effects that are fitted to the end along the motion."""
 GLANCED = 4
 """Partners of a leader that are fitted to the end."""
+SIMPLE, AGAIN = 2, 4
+"""Parameters of a candidate that is simulated from one point only, and how many others are from several."""
+KIN = 2
+"""Relatives of the best pair's members, of which partners are looked for as well."""
 WORTH = 0.5
 """Share of the best effect's gain from which another is simulated."""
 DOUBT = 0.05
@@ -175,7 +179,7 @@ def name_effects(
         before = screen.misfit(key, nothing)
         remain = lambda found: share_left(screen.misfit(key, found), before)  # noqa: E731
         worth = thresholds.worth * remain(ranked[0]) if explained else np.inf
-        pairs = [pair for pair in _pair(screens, ranked, begun)[:PAIRS] if remain(pair) < worth]
+        pairs = [pair for pair in _pair(key, screens, nothing, ranked, begun)[:PAIRS] if remain(pair) < worth]
         if pairs:
             alone = {k for pair in pairs for k in pair.candidate.effects}
             best = {work.numbers[k] for entry in entries[:2] for k in entry.candidate.effects}
@@ -244,8 +248,17 @@ def _finalists(screen: Screen, nothing: Screened, ranked: Sequence[Screened]) ->
     ]
 
 
-def _pair(screens: Sequence[Screen], ranked: Sequence[Screened], begun: Sequence[Begun]) -> list[Screened]:
-    """Pairs of the best single effects with every other one, then of the best pair's members, the best first."""
+def _pair(
+    key: PRNGKeyArray,
+    screens: Sequence[Screen],
+    nothing: Screened,
+    ranked: Sequence[Screened],
+    begun: Sequence[Begun],
+) -> list[Screened]:
+    """Pairs with every other effect, the best first: of leading single effects, of the best pair's members and kin.
+
+    A special case may do best by itself, and with a partner that makes up for what it lacks, and hide its general case.
+    """
     found: list[Screened] = []
     seen: set[Candidate] = set()
     first = screens[0]
@@ -266,14 +279,34 @@ def _pair(screens: Sequence[Screen], ranked: Sequence[Screened], begun: Sequence
         ended = _each(screens, [pair for _, pair in best], finish)
         found.extend(each for each in ended if each is not None)
 
-    for known in ranked[:LEADERS]:
+    leaders = _leaders(first, nothing, ranked)
+    for known in leaders:
         extend(known)
-    led = {known.candidate.effects[0] for known in ranked[:LEADERS]}
     best = max(found, key=lambda item: item.score, default=None)
-    for k in best.candidate.effects if best else ():
-        if best and k not in led:
-            extend(first.part(best, k))
+    if best is None:
+        return []
+    led = [known.candidate for known in leaders]
+    members = [Candidate((k,)) for k in best.candidate.effects]
+    for member in members:
+        if member not in led:
+            extend(first.part(best, member.effects[0]))
+    if first.misfit(key, best).p_value < FALSE_ALARMS:
+        names = [first.name(member) for member in members]
+        kin = [each for each in ranked if any(are_kin(first.name(each.candidate), name) for name in names)]
+        for known in [each for each in kin if each.candidate not in [*led, *members]][:KIN]:
+            extend(known)
     return sorted(found, key=lambda item: -item.score)
+
+
+def _leaders(screen: Screen, nothing: Screened, ranked: Sequence[Screened]) -> list[Screened]:
+    """The best single effects, and those that come near them with fewer parameters: these leave room for a partner."""
+    leaders = list(ranked[:LEADERS])
+    least = WORTH * (ranked[0].score - nothing.score)
+    for found in ranked[LEADERS:]:
+        fewest = min(screen.scene.count(known.candidate) for known in leaders)
+        if screen.scene.count(found.candidate) < fewest and found.score - nothing.score > least:
+            leaders.append(found)
+    return leaders
 
 
 def _still(problem: Problem, fit: Fit) -> Fit:
@@ -293,27 +326,39 @@ def _without(work: _Work, problem: Problem, detected: Entry) -> Entry:
 
 
 def _finish(work: _Work, none: Entry, candidates: Sequence[Screened], ahead: Shots | None) -> list[Entry]:
-    """Candidates simulated and fitted from where the screen found them, and scored across recordings, best first."""
+    """Candidates simulated and fitted from where the screen found them, and scored across recordings, best first.
+
+    The best of those with many parameters that leave something are fitted from their usual values, too: where joints
+    stick and slip, what fits along the smoothed motion may be far from what fits in simulation.
+    """
     bench = work.bench
 
-    def finish(found: Screened) -> Entry | None:
-        own = Candidate(tuple(work.numbers.index(k) for k in found.candidate.effects))
-        delta, sigma = jnp.zeros_like(none.fit.delta), jnp.maximum(found.sigma, work.floor)
-        fit = bench.fit(own, found.p, delta, sigma)
-        if not np.isfinite(float(fit.cost)):
-            return None
-        entry = _enter(work, own, work.settle(own, fit))
-        entry.scores = np.logaddexp(np.log1p(-DOUBT) + entry.scores, np.log(DOUBT) + none.scores)
-        return entry
+    def finish(own: Candidate, points: Sequence[Float[Array, " k"]], sigma: Array, known: Entry | None) -> Entry | None:
+        entries = [known] if known else []
+        for p in points:
+            fit = bench.fit(own, p, jnp.zeros_like(none.fit.delta), jnp.maximum(sigma, work.floor))
+            if np.isfinite(float(fit.cost)):
+                entry = _enter(work, own, work.settle(own, fit))
+                entry.scores = np.logaddexp(np.log1p(-DOUBT) + entry.scores, np.log(DOUBT) + none.scores)
+                entries.append(entry)
+        return max(entries, key=lambda entry: entry.score, default=None)
 
-    entries = []
+    def begin(found: Screened) -> Entry | None:
+        own = Candidate(tuple(work.numbers.index(k) for k in found.candidate.effects))
+        return finish(own, [found.p], found.sigma, None)
+
+    def again(entry: Entry) -> Entry | None:
+        return finish(entry.candidate, bench.starts(entry.candidate, jnp.zeros(bench.d)), entry.fit.sigma, entry)
+
     with ThreadPoolExecutor(WORKERS) as pool:
         # the first by itself: what it compiles is there for the others
-        for entry in chain(map(finish, candidates[:1]), pool.map(finish, candidates[1:])):
-            if entry is not None:
-                entries.append(entry)
-                work.say(f"{' + '.join(entry.names)}: score {entry.score:.1f}")
-    entries.sort(key=lambda entry: -entry.score)
+        tried = chain(map(begin, candidates[:1]), pool.map(begin, candidates[1:]))
+        entries = sorted((entry for entry in tried if entry is not None), key=lambda entry: -entry.score)
+        left = [e for e in entries if e.misfit.p_value < FALSE_ALARMS and len(bench.columns(e.candidate)) > SIMPLE]
+        better = dict(zip(map(id, left), pool.map(again, left[:AGAIN]), strict=False))
+    entries = sorted((better.get(id(entry)) or entry for entry in entries), key=lambda entry: -entry.score)
+    for entry in entries:
+        work.say(f"{' + '.join(entry.names)}: score {entry.score:.1f}")
     if ahead is not None and entries:
         _look_ahead(bench, none, entries, ahead)
     return entries
@@ -348,4 +393,5 @@ def _enter(work: _Work, candidate: Candidate, fit: Fit, known: Float[np.ndarray,
     scores = np.nan_to_num(np.asarray(scores), nan=-1e12)
     misfit_key = jax.random.fold_in(work.key, sum(2**k for k in candidate.effects) % (2**31))
     misfit = judge_misfit(misfit_key, np.asarray(fit.misses), fit.along_states, np.asarray(measured), known)
-    return Entry(candidate, bench.names(candidate), fit, scores, misfit, seats=bench.seats(candidate))
+    share = float(-0.5 * fit.z @ fit.z - 0.5 * jnp.linalg.slogdet(fit.precision)[1])
+    return Entry(candidate, bench.names(candidate), fit, scores, misfit, log_share=share, seats=bench.seats(candidate))

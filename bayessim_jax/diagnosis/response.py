@@ -88,6 +88,8 @@ class Forcing:
     """Readings are `scale · reading + shift`: 1 where no sensor is concerned."""
     shift: Float[Array, "windows rows obs"]
     reading_along: Float[Array, "windows rows obs k"]
+    first_along: Float[Array, "windows n k"]
+    """How the motion's first state moves with what readings are restored by."""
 
 
 def separate(model: mujoco.MjModel, origin: Float[Array, " nq"], to: Float[Array, " nq"]) -> Float[Array, " nv"]:
@@ -187,7 +189,7 @@ def assess(
     def one(a: Array, b: Array, along: Array, gap: Array, w: Windowed, f: Forcing, d: Array) -> tuple[Array, Array]:
         forced = gap + jnp.einsum("tnv,tv->tn", b, f.force) + along @ moved
         columns = along + jnp.einsum("tnv,tvk->tnk", b, f.force_along)
-        first = jnp.concatenate([d[:, None], jnp.zeros((n, k)), jnp.eye(n)], 1)
+        first = jnp.concatenate([d[:, None], f.first_along, jnp.eye(n)], 1)
         added = jnp.concatenate([forced[..., None], columns, jnp.zeros((len(gap), n, n))], -1)
         seen = jnp.einsum("ton,tnk->tok", w.c, _propagate(a, first, added))
         value = f.scale * (w.seen + seen[..., 0]) + f.shift

@@ -228,7 +228,10 @@ class Scene:
         return acceleration, jnp.asarray(jnp.gradient(acceleration, self.system.dt, axis=1))
 
     def _restored(self, candidate: Candidate, p: np.ndarray) -> tuple[Motion, list[tuple[Any, ...]]]:
-        """The true motion behind what sensors with effects showed: channel, ∂q/∂x, ∂q/∂reading, place in p."""
+        """The true motion behind what sensors with effects showed.
+
+        Of every reading: channel, degree of freedom, ∂q/∂x, ∂v/∂x, ∂q/∂reading, place in p.
+        """
         motion, readings = self.motion, []
         for k, place in self.offsets(candidate):
             effect, name = self.pairs[k]
@@ -239,14 +242,16 @@ class Scene:
             channels = [c.name for c in self.system.channels]
             rows = motion.start[:, None] + self.system.dt * jnp.arange(motion.qpos.shape[1])
             seen = (motion.qpos[..., q], motion.qvel[..., v], *(rate[..., v] for rate in self._rates))
-            new_q, new_v, along, slope = restore_readings(
+            new_q, new_v, along, along_v, slope = restore_readings(
                 effect, self.kinds[k], self.system.dt, p[place], *self.ranges[k], rows, *seen
             )
             qpos, qvel = motion.qpos.at[..., q].set(new_q), motion.qvel
             if name.removesuffix("/qpos") + "/qvel" not in channels:
                 qvel = qvel.at[..., v].set(new_v)
+            else:
+                along_v = jnp.zeros_like(along_v)
             motion = dataclasses.replace(motion, qpos=qpos, qvel=qvel)
-            readings.append((channels.index(at(name)), along, slope, place.start))
+            readings.append((channels.index(at(name)), v, along, along_v, slope, place.start))
         return motion, readings
 
     def _pushes(self, e: int, p: np.ndarray, place: slice, around: _Around) -> list[tuple[Any, ...]]:
@@ -385,7 +390,8 @@ def _assemble(
         force = force + f[..., None] * at_dof
         along = along + jnp.einsum("wte,ek,v->wtvk", slopes, place.astype(float), at_dof.astype(float))
     scale, shift, reading_along = jnp.ones_like(seen), jnp.zeros_like(seen), jnp.zeros((*seen.shape, size))
-    for channel, raw, own, slope, first in sensed:
+    first_along = jnp.zeros((windows, 2 * nv, size))
+    for channel, raw, dof, own, own_v, slope, first in sensed:
         here = jnp.arange(seen.shape[-1]) == channel
         place = jnp.arange(size) == first + jnp.arange(own.shape[-1])[:, None]
         s = 1.0 / slope
@@ -393,7 +399,10 @@ def _assemble(
         shift = jnp.where(here, (raw[..., None] - s[..., None] * seen), shift)
         moved = jnp.einsum("wte,ek->wtk", -s[..., None] * own, place.astype(float))
         reading_along = reading_along + here[:, None] * moved[:, :, None]
-    return Forcing(force, along, scale, shift, reading_along)
+        state = jnp.arange(2 * nv)[:, None] == jnp.array([dof, nv + dof])
+        begun = jnp.stack([own[:, 0], own_v[:, 0]], 1)
+        first_along = first_along + jnp.einsum("nd,wde,ek->wnk", state.astype(float), begun, place.astype(float))
+    return Forcing(force, along, scale, shift, reading_along, first_along)
 
 
 def _see_one(system: MjcfSystem, theta: Array, qpos: Array, qvel: Array, ctrl: Array) -> tuple[Array, Array]:

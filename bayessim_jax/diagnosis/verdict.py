@@ -58,6 +58,8 @@ class Thresholds:
     """Share of what the best candidate gains by which others may be worse and tie, where it is not wholly right."""
     least: float = 4.0
     """Nats in all by which a candidate has to be worse to be out of the confusion set."""
+    coincidence: float = 5.0
+    """Nats by which its numbers may be a greater coincidence than another's that does as well."""
 
 
 @dataclass(eq=False)
@@ -72,6 +74,11 @@ class Entry:
     misfit: Misfit
     ahead: float = float("nan")
     """Share of the baseline's error that predictions as long as the horizon still have beyond the noise, if known."""
+    log_share: float = 0.0
+    """Log of the share of its prior that the candidate's numbers are found in: the evidence over the best likelihood.
+
+    Source: MacKay 1992
+    """
     seats: Mapping[str, str] = field(default_factory=dict)
     """Names of effects on actuators, and the same at the joint that is driven."""
 
@@ -151,7 +158,8 @@ def decide(
     """One of four verdicts on a simulator whose misfit was detected; `entries` come best first.
 
     The confusion set is what explains the misfit and predicts held-out windows as well as the best candidate; of these
-    the ones with the fewest effects, and of effects that contain one another the special case.
+    the ones with the fewest effects, of effects that contain one another the special case, and none that does so only
+    with numbers that are a coincidence where others need none: a ripple with one cycle per turn is a tilt.
     """
     result = Diagnosis("unexplained", bench, none, entries, screened=screened)
     if not entries or entries[0].score - none.score < thresholds.least:
@@ -167,6 +175,8 @@ def decide(
     fewest = min(len(entry.candidate.effects) for entry in tied)
     least = [entry for entry in tied if len(entry.candidate.effects) == fewest]
     sets = [entry for entry in least if not any(_has_special_case(entry, other) for other in least)]
+    least_share = max(entry.log_share for entry in sets) - thresholds.coincidence
+    sets = [entry for entry in sets if entry.log_share >= least_share]
     result.confusion = sorted(sets, key=lambda e: (len(bench.columns(e.candidate)), -e.score))
     result.probabilities = _weigh(result, group, thresholds.least / _resolution(entries[0], none, thresholds))
     result.verdict = "explained" if len(sets) == 1 else "ambiguous"

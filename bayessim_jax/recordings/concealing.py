@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
+import copy
 from typing import TYPE_CHECKING, Any
 
+import mujoco
 import numpy as np
 
-from bayessim_jax.concealment import KINDS, RunawayError, choose_place, hide, lookup_law, make_scene
+from bayessim_jax.concealment import KINDS, ModelLaw, RunawayError, choose_place, hide, lookup_law, make_scene
 from bayessim_jax.recordings.augment import write_values
 from bayessim_jax.recordings.case import FILE, SCHEMA
 from bayessim_jax.recordings.files import to_json, write_text
 from bayessim_jax.recordings.layout import HINGE, SLIDE, Layout, layout_of_model
 from bayessim_jax.recordings.mjcf import compile_spec, read_spec
-from bayessim_jax.recordings.paths import Target, find_target
+from bayessim_jax.recordings.paths import Target, find_target, nominal
 from bayessim_jax.recordings.starter import candidates, copy_model, label_target, parameter_text, toml_string
 from bayessim_jax.recordings.wording import CaseError
 from bayessim_jax.spelling import near_miss
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
     from pathlib import Path
 
     from bayessim_jax.concealment import Hidden, Track
 
-__all__ = ["SEALED", "conceal"]
+__all__ = ["SEALED", "AbsorbedError", "conceal"]
 
 SEALED = "sealed.json"
 """The file of a case that says what is concealed in it; nothing that diagnoses reads it."""
@@ -39,6 +41,10 @@ model = {model}
 recordings = "recordings/*.csv"
 horizon = {horizon:g}
 """
+
+
+class AbsorbedError(ValueError):
+    """An effect that changes nothing but what is unknown: the model with other values lacks nothing."""
 
 
 def conceal(
@@ -95,6 +101,7 @@ def conceal(
         )
         chosen = [choose_place(machine, name, place, rng) for name, place in zip(names, places, strict=True)]
         hidden = [hide(scene, *one, seed) for one in zip(names, chosen, strengths, strict=True)]
+        _check_hidden(spec, machine, hidden, truth)
         tracks = scene.play([h.law for h in hidden]) if hidden else scene.clean
     except RunawayError as error:
         raise ValueError(f"{model.name}: {error}; choose other motions, or less strength.") from error
@@ -189,6 +196,31 @@ def _priors(model: Any, parameters: Sequence[str] | None) -> dict[Target, tuple[
             told = near_miss(str(target), [str(t) for t in every])
             raise ValueError(f"parameter {str(target)!r}: it has no range to be drawn from; {told}")
     return {target: every[target] for target in chosen}
+
+
+def _check_hidden(spec: Any, machine: Any, hidden: Sequence[Hidden], unknown: Collection[Target]) -> None:
+    """Raise `AbsorbedError` where one of the effects is the model with other values of what is unknown."""
+    for one in hidden:
+        if not isinstance(one.law, ModelLaw):
+            continue
+        edited = copy.copy(machine)
+        one.law.edit(edited)
+        other = write_values(spec.copy(), {target: nominal(target, edited) for target in unknown})
+        for model in (edited, other):
+            mujoco.mj_setConst(model, mujoco.MjData(model))
+        if _are_alike(edited, other) and _are_alike(edited.opt, other.opt):
+            told = ", ".join(map(str, unknown))
+            raise AbsorbedError(
+                f"effect {one.name!r} at {one.law.spot.place!r}: it only moves {told}, unknown in the case; "
+                "choose another place, or other parameters."
+            )
+
+
+def _are_alike(one: Any, other: Any) -> bool:
+    """Whether all arrays of real numbers are the same."""
+    named = ((getattr(one, name), getattr(other, name)) for name in dir(one) if not name.startswith("_"))
+    arrays = (pair for pair in named if isinstance(pair[0], np.ndarray) and pair[0].dtype.kind == "f")
+    return all(np.allclose(*pair, rtol=1e-9, atol=1e-12) for pair in arrays)
 
 
 def _machine(spec: Any, truth: dict[Target, float]) -> Any:

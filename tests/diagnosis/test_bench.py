@@ -55,6 +55,27 @@ def problem(tmp_path_factory):
     jax.config.update("jax_enable_x64", False)
 
 
+@pytest.mark.parametrize("name", ["sensor_offset", "sensor_delay"])
+def test_the_screen_knows_what_a_sensors_error_changes_in_the_first_state_too(problem, name):
+    place = "joint/hinge/qpos"
+    scene = dataclasses.replace(problem, scales={place: Scales(timestep=0.002, period=0.004)}).screen(
+        [(EFFECTS[name], place)]
+    )
+    scene = scene.scene
+    free, sigma = Candidate((0,)), jnp.ones(len(problem.system.channels))
+    p = np.zeros(scene.d + scene.slots)
+    still = jnp.zeros((len(scene.motion.start), 2))
+
+    def residuals(x):
+        moved = p.copy()
+        moved[scene.d] = x
+        return scene.assess(free, moved, still, sigma)
+
+    slope = np.asarray(residuals(0.0)[2])[:, scene.d].reshape(np.shape(residuals(0.0)[1]))
+    beside = (np.asarray(residuals(1e-4)[1]) - np.asarray(residuals(-1e-4)[1])) / 2e-4
+    np.testing.assert_allclose(-slope, beside, atol=0.1 * np.abs(beside).max())
+
+
 def predicted(bench, candidate, x):
     shots = bench.setup(candidate)
     still = jnp.zeros((shots.y.shape[0], shots.spread.size))

@@ -59,7 +59,8 @@ def test_the_response_to_a_force_is_the_simulators_to_first_order(arm):
             jnp.ones(4),
         )
         none = jnp.zeros((1, STEPS + 1, 4))
-        forcing = Forcing(size * push[None], jnp.zeros((1, STEPS, 2, 1)), none + 1.0, none, none[..., None])
+        still = jnp.zeros((1, 4, 1))
+        forcing = Forcing(size * push[None], jnp.zeros((1, STEPS, 2, 1)), none + 1.0, none, none[..., None], still)
         _, r, _ = assess(lin, seen, forcing, jnp.zeros(1), jnp.zeros(1), jnp.zeros((1, 4)), jnp.ones(4))
         errors.append(float(jnp.abs(r).max() / jnp.abs(moved - plain).max()))
     assert errors[1] < 1e-3
@@ -127,7 +128,7 @@ def test_a_scaled_sensor_is_undone_with_its_derivatives():
     still = jnp.zeros_like(q)
     low, high = jnp.array([0.5]), jnp.array([2.0])
     kinds, x = (("scale", "uniform"),), jnp.zeros(1)
-    true, _, along_x, slope = restore_readings(
+    true, _, along_x, _, slope = restore_readings(
         EFFECTS["sensor_scale"], kinds, 0.004, x, low, high, still, q, still, still, still
     )
     np.testing.assert_allclose(true, q / 1.25, rtol=1e-10)

@@ -41,6 +41,15 @@ def test_candidates_that_predict_alike_are_a_confusion_set():
     assert min(found.probabilities) > 0.01
 
 
+@pytest.mark.parametrize(("share", "wanted"), [(-12.0, "ambiguous"), (-20.0, "explained")])
+def test_what_does_as_well_by_a_coincidence_of_its_numbers_is_no_rival(share, wanted):
+    plain, contrived = entry(["a@x"], 100.0, 0.002), entry(["b@x"], 100.0, 0.002, seed=1)
+    plain.log_share, contrived.log_share = -10.0, share
+    found = verdict(plain, contrived)
+    assert found.verdict == wanted
+    assert ["a@x"] in [each.names for each in found.confusion]
+
+
 @pytest.mark.parametrize(("p", "wanted"), [(0.001, "ambiguous"), (0.4, "explained")])
 def test_small_differences_say_nothing_where_the_best_is_not_wholly_right(p, wanted):
     """The second is worse by 0.3 % of what the best gains: far more than chance, and little against what both leave."""

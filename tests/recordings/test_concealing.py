@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bayessim_jax.cli.main import main
-from bayessim_jax.recordings.concealing import SEALED, conceal
+from bayessim_jax.recordings.concealing import SEALED, AbsorbedError, conceal
 from bayessim_jax.recordings.loading import load_case
 from benchmarks.concealed import GROUPS, draw_cases, judge, summarize
 from benchmarks.worlds import MODELS, RIGS
@@ -44,6 +44,22 @@ def test_a_clean_world_is_the_simulator_with_the_true_parameters(tmp_path, model
                 assert abs(data.qpos[0] - recording.qpos[k, 0]) < most
                 data.ctrl[:] = recording.ctrl[k]
                 mujoco.mj_step(true, data, 2 * divide)
+
+
+def test_what_only_moves_what_is_unknown_hides_nothing(tmp_path):
+    model = tmp_path / "model.xml"
+    model.write_text(RIGS["swing"].xml)
+    settings = {"parameters": ["body/rod/ipos/2"], "at": "body/rod", "strength": 0.2, **QUICK}
+    told = set()
+    for seed in range(4):  # along the rod or across it, as the seed draws
+        folder = tmp_path / str(seed)
+        try:
+            told.add(conceal(folder, model, "link_offset", seed=seed, **settings)["effects"][0]["at"])
+        except AbsorbedError as error:
+            told.add(str(error))
+            assert not folder.exists()
+    assert len(told) == 2
+    assert any("it only moves body/rod/ipos/2" in each for each in told)
 
 
 def test_the_label_is_sealed_and_never_read(tmp_path, model):
