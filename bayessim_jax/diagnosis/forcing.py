@@ -152,11 +152,12 @@ def commands_of(
     return _with_slopes(change, x)
 
 
-@partial(jax.jit, static_argnames=("effect", "kinds", "period"), compiler_options=COMPILER_OPTIONS)
+@partial(jax.jit, static_argnames=("effect", "kinds", "period", "prompt"), compiler_options=COMPILER_OPTIONS)
 def restore_readings(
     effect: Any,
     kinds: Kinds,
     period: float,
+    prompt: bool,
     x: Float[Array, " k"],
     low: Float[Array, " k"],
     high: Float[Array, " k"],
@@ -166,10 +167,13 @@ def restore_readings(
     acceleration: Float[Array, "windows rows"],
     jerk: Float[Array, "windows rows"],
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """True positions and velocities behind readings of a `SenseEffect`, ∂q/∂x, ∂v/∂x, and ∂q/∂reading."""
+    """True positions and velocities behind readings of a `SenseEffect`, ∂q/∂x, ∂v/∂x, and ∂q/∂reading.
+
+    `prompt` where velocities are measured of themselves.
+    """
 
     def restore(x: Array, position: Array) -> tuple[Array, Array]:
-        moment = Moment(time, period, position, velocity, acceleration, jerk=jerk)
+        moment = Moment(time, period, position, velocity, acceleration, jerk=jerk, prompt=prompt)
         q, v = effect.restore(_values(kinds, x, low, high), moment)
         return q * jnp.ones_like(time), v * jnp.ones_like(time)
 

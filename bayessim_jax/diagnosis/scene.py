@@ -242,14 +242,15 @@ class Scene:
             channels = [c.name for c in self.system.channels]
             rows = motion.start[:, None] + self.system.dt * jnp.arange(motion.qpos.shape[1])
             seen = (motion.qpos[..., q], motion.qvel[..., v], *(rate[..., v] for rate in self._rates))
+            prompt = name.removesuffix("/qpos") + "/qvel" in channels
             new_q, new_v, along, along_v, slope = restore_readings(
-                effect, self.kinds[k], self.system.dt, p[place], *self.ranges[k], rows, *seen
+                effect, self.kinds[k], self.system.dt, prompt, p[place], *self.ranges[k], rows, *seen
             )
             qpos, qvel = motion.qpos.at[..., q].set(new_q), motion.qvel
-            if name.removesuffix("/qpos") + "/qvel" not in channels:
-                qvel = qvel.at[..., v].set(new_v)
-            else:
+            if prompt:
                 along_v = jnp.zeros_like(along_v)
+            else:
+                qvel = qvel.at[..., v].set(new_v)
             motion = dataclasses.replace(motion, qpos=qpos, qvel=qvel)
             readings.append((channels.index(at(name)), v, along, along_v, slope, place.start))
         return motion, readings

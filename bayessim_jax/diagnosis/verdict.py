@@ -44,7 +44,9 @@ class Thresholds:
     """Share of the baseline's misfit that an explanation may leave."""
     ahead: float = 0.3
     """Share of the baseline's error of predictions ahead that an explanation of the misfit may leave."""
-    foreseen: float = 0.01
+    both: float = 0.001
+    """The one share times the other: what leaves something of both has found something else."""
+    foreseen: float = 0.003
     """Share of the baseline's error of predictions ahead, below which what pieces leave is the sensors' own."""
     enough: float = 0.015
     """Share that a single effect may leave before pairs are tried."""
@@ -190,7 +192,8 @@ def explains(entry: Entry, none: Entry, thresholds: Thresholds) -> bool:
     """
     if entry.misfit.p_value >= FALSE_ALARMS or entry.ahead <= thresholds.foreseen:
         return True
-    return share_left(entry.misfit, none.misfit) <= thresholds.left and not entry.ahead > thresholds.ahead
+    left = share_left(entry.misfit, none.misfit)
+    return left <= thresholds.left and not (entry.ahead > thresholds.ahead or left * entry.ahead > thresholds.both)
 
 
 def _suffices(entry: Entry, tied: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:

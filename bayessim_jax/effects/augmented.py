@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import jax
@@ -126,18 +128,34 @@ class AugmentedMjcf:
         positions and velocities of as many control periods, for effects that remember how a joint has moved.
         """
         kind = jnp.result_type(theta)
-        numbers, inner = self._prepare(theta)
         qpos, qvel = (jnp.asarray(x, kind) for x in (qpos, qvel))
         first = jnp.zeros(self.actions.size, kind) if action is None else jnp.asarray(action, kind)
-        held = first if past is None or not len(past) else jnp.asarray(past[0], kind)
         time = jnp.asarray(time, kind)
         late = [w for _, w in self._senses() if w.effect.remembers]
         bent = [w for _, w in self._senses() if not w.effect.remembers]
         still = jnp.zeros_like(qvel)
         qpos, qvel = self._restore(bent, theta, qpos, qvel, time, still, still)
-        if late:
-            seen = AugmentedState(MjcfState(self.engine.init(inner, qpos, qvel), held), (), (), time)
-            qpos, qvel = self._restore(late, theta, qpos, qvel, time, *self._curve(inner, seen, held))
+        start = partial(self._start, theta, action=first, time=time, past=past, motion=motion)
+        if not late:
+            return start(qpos, qvel)
+        seen = self._begin_late(theta, start(qpos, qvel), still, still)
+        curve = self._curve(theta, seen, first)
+        return self._begin_late(theta, start(*self._restore(late, theta, qpos, qvel, time, *curve)), *curve)
+
+    def _start(
+        self,
+        theta: Float[Array, " d"],
+        qpos: Float[Array, " nq"],
+        qvel: Float[Array, " nv"],
+        action: Float[Array, " act"],
+        time: Scalar,
+        past: Actions | None,
+        motion: tuple[Float[Array, "periods nq"], Float[Array, "periods nv"]] | None,
+    ) -> AugmentedState:
+        """The state with these true positions and velocities."""
+        kind, first = jnp.result_type(theta), action
+        numbers, inner = self._prepare(theta)
+        held = first if past is None or not len(past) else jnp.asarray(past[0], kind)
         physics = self.engine.init(inner, qpos, qvel)
         inertias = {
             joint: share * probe_inertia(self.engine, inner, self.base.qpos.astype(kind), self._dof(joint))
@@ -363,19 +381,12 @@ class AugmentedMjcf:
         state: AugmentedState,
         commands: list[Number],
     ) -> AugmentedState:
-        """Memories of the other effects, from what the joints are about to do without anything that holds them."""
+        """Memories of the effects at joints, from what these are about to do without anything that holds them."""
         memories = list(state.memories)
-        remembering = [(k, w) for k, w in self._at("sense") if w.effect.remembers]
-        if self._at("force") or remembering:
+        if self._at("force"):
             kind = state.time.dtype
             ctrl = jnp.stack([jnp.asarray(c, kind) for c in commands]) if commands else state.base.ctrl
             acceleration = self._push(inner, state.base.physics, ctrl)
-            jerk = self._curve(inner, state, ctrl)[1] if remembering else acceleration
-            for k, w in remembering:
-                dof = self._dof(w.site.joint)
-                moment = self._sensor_moment(state, w.site)
-                moment = moment._replace(h=self.dt, acceleration=acceleration[dof], jerk=jerk[dof])
-                memories[k] = _arrays(w.effect.begin(w.values(theta), moment), state.time)
             before = [
                 replace(grip, velocity=grip.velocity - self._h / CAUTION * acceleration[self._dof(joint)])
                 for (joint, _), grip in zip(self.shares, state.grips, strict=True)
@@ -385,6 +396,19 @@ class AugmentedMjcf:
         for k, w in self._at("force"):
             moment = self._joint_moment(numbers, state, w.site, commands, accelerations)
             memories[k] = _arrays(w.effect.begin(w.values(theta), moment), state.time)
+        return replace(state, memories=tuple(memories))
+
+    def _begin_late(
+        self, theta: Float[Array, " d"], state: AugmentedState, acceleration: Array, jerk: Array
+    ) -> AugmentedState:
+        """What late sensors remember of a joint that came with this acceleration and jerk."""
+        memories = list(state.memories)
+        for k, w in self._senses():
+            if w.effect.remembers:
+                dof = self._dof(w.site.joint)
+                moment = self._sensor_moment(state, w.site)
+                moment = moment._replace(h=self.dt, acceleration=acceleration[dof], jerk=jerk[dof])
+                memories[k] = _arrays(w.effect.begin(w.values(theta), moment), state.time)
         return replace(state, memories=tuple(memories))
 
     def _recall(
@@ -407,12 +431,16 @@ class AugmentedMjcf:
         return (self.engine.qvel(after) - self.engine.qvel(physics)) / self._h
 
     def _curve(
-        self, inner: Float[Array, " e"], state: AugmentedState, ctrl: Float[Array, " act"]
+        self, theta: Float[Array, " d"], state: AugmentedState, action: Float[Array, " act"]
     ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
-        """Accelerations, and how they change within a control period."""
-        later = self.engine.step(inner, state.base.physics, ctrl, None, self.substeps)
-        now, then = (self._push(inner, physics, ctrl) for physics in (state.base.physics, later))
-        return now, (then - now) / self.dt
+        """Accelerations under all effects, and how they change, from two control periods."""
+        period = self._period(theta, *self._prepare(theta))
+        states = [state]
+        for _ in range(2):
+            states.append(period(states[-1], action))
+        now, then = ((self.velocities(after) - self.velocities(before)) / self.dt for before, after in pairwise(states))
+        jerk = (then - now) / self.dt
+        return now - 0.5 * self.dt * jerk, jerk
 
     def _accelerations(self, state: AugmentedState) -> dict[int, Number]:
         """What the joints did in the last time step, less what held them: a = (v − v⁻)/h − f⁻/m."""
@@ -475,11 +503,12 @@ class AugmentedMjcf:
             if w.site.joint < 0:
                 continue
             q, v = int(self.engine.model.jnt_qposadr[w.site.joint]), self._dof(w.site.joint)
-            moment = Moment(time, self.dt, qpos[q], qvel[v], acceleration[v], jerk=jerk[v])
+            prompt = w.place.removesuffix("/qpos") + "/qvel" in seen
+            moment = Moment(time, self.dt, qpos[q], qvel[v], acceleration[v], jerk=jerk[v], prompt=prompt)
             position, velocity = w.effect.restore(w.values(theta), moment)
             if not w.place.endswith("/qvel"):
                 qpos = qpos.at[q].set(position)
-            if w.place.endswith("/qvel") or w.place.removesuffix("/qpos") + "/qvel" not in seen:
+            if w.place.endswith("/qvel") or not prompt:
                 qvel = qvel.at[v].set(velocity)
         return qpos, qvel
 

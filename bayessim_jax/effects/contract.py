@@ -145,6 +145,8 @@ class Moment(NamedTuple):
     """At an actuator's command: N or N m on the joint for one unit of it."""
     jerk: Number = 0.0
     """How the acceleration changes, where a sensor's effect begins."""
+    prompt: bool = False
+    """Whether velocity, acceleration and jerk are those of now where a sensor shows a position late."""
     other: Any = None
     """The same for the second joint of a place that has two."""
     detail: str = ""

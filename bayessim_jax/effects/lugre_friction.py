@@ -26,6 +26,7 @@ class LuGreFriction(ForceEffect):
 
     name = "lugre_friction"
     holds = True
+    recalls = True
 
     def places(self, model: mujoco.MjModel) -> list[str]:
         """Every hinge and slide."""

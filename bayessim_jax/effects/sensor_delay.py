@@ -24,8 +24,8 @@ class SensorDelay(SenseEffect):
     """q(t) ↦ q(t − T), T any fraction of a control period.
 
     Between the control periods that are remembered q is the cubic with their positions and velocities. A simulation
-    begins where the joint will be T after it was where it was measured, by its acceleration and its jerk. T in s, 0.1
-    at most.
+    begins where the joint will be T after it was where it was measured, by its acceleration and its jerk then, or by
+    those of now where its velocity is measured of itself. T in s, 0.1 at most.
     """
 
     name = "sensor_delay"
@@ -63,7 +63,10 @@ class SensorDelay(SenseEffect):
 
     def restore(self, values: Values, moment: Moment) -> tuple[Number, Number]:
         """Where it is T after it was there."""
-        return _move(moment, values["seconds"])
+        if not moment.prompt:
+            return _move(moment, values["seconds"])
+        was, _ = _move(moment, -values["seconds"])
+        return moment.position + (moment.position - was), moment.velocity
 
 
 def _count(period: float) -> int:

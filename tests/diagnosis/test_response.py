@@ -129,7 +129,7 @@ def test_a_scaled_sensor_is_undone_with_its_derivatives():
     low, high = jnp.array([0.5]), jnp.array([2.0])
     kinds, x = (("scale", "uniform"),), jnp.zeros(1)
     true, _, along_x, _, slope = restore_readings(
-        EFFECTS["sensor_scale"], kinds, 0.004, x, low, high, still, q, still, still, still
+        EFFECTS["sensor_scale"], kinds, 0.004, False, x, low, high, still, q, still, still, still
     )
     np.testing.assert_allclose(true, q / 1.25, rtol=1e-10)
     np.testing.assert_allclose(slope, 1 / 1.25, rtol=1e-10)

@@ -73,8 +73,12 @@ def test_what_explains_pieces_and_predicts_no_better_explains_nothing():
     for ahead, wanted in ((0.95, "unexplained"), (0.2, "explained")):
         found.ahead = ahead
         assert verdict(found).verdict == wanted
+    some = entry(["a@x"], 100.0, 0.02)
+    for ahead, wanted in ((0.2, "unexplained"), (0.02, "explained")):
+        some.ahead = ahead
+        assert verdict(some).verdict == wanted
     rough = entry(["a@x"], 100.0, 0.3)
-    for ahead, wanted in ((0.008, "explained"), (0.02, "unexplained")):
+    for ahead, wanted in ((0.002, "explained"), (0.02, "unexplained")):
         rough.ahead = ahead
         assert verdict(rough).verdict == wanted
 

@@ -272,16 +272,31 @@ def test_sensors_show_what_they_are_said_to_and_states_begin_as_measured():
     np.testing.assert_allclose(shown, 1.1 * true, atol=1e-12)
 
 
+@pytest.mark.parametrize("moved", [0.0, 0.3, 1.0, 4.0])
+def test_bristles_are_recalled_as_they_bent(moved):
+    """After lasting motion one way, and a way x back: s = −F + 2 F exp(−σ₀ x / F)."""
+    level, stiffness, h = 2.0, 500.0, 1e-4
+    values = {"stiffness": stiffness, "damping": 3.0, "coulomb": level, "static": level, "velocity": 0.1}
+    back = round(moved * level / stiffness / (0.1 * h))
+    velocities = jnp.concatenate([jnp.full(3000, 0.1), jnp.full(back, -0.1)])
+    still = jnp.zeros_like(velocities)
+    bent = EFFECTS["lugre_friction"].recall(values, jnp.zeros(()), still, velocities, still, h)
+    assert float(bent) == pytest.approx(-level + 2 * level * np.exp(-moved), abs=0.01 * level)
+
+
+@pytest.mark.parametrize("prompt", [False, True])
 @pytest.mark.parametrize("delay", [0.01, 0.023, 0.05])
-def test_a_late_sensor_shows_what_was(delay):
-    base = mjcf_system(pendulum(), [], observe=["joint/hinge/qpos"], substeps=5, engine="tree")
+def test_a_late_sensor_shows_what_was(delay, prompt):
+    """Positions come late; velocities with them, or of themselves and in time."""
+    channels = ["joint/hinge/qpos", "joint/hinge/qvel"][: 1 + prompt]
+    base = mjcf_system(pendulum(), [], observe=channels, substeps=5, engine="tree")
     fine = mjcf_system(pendulum(1e-4), [], engine="tree")
     bare = jnp.zeros(0)
     begun = fine.begin(bare, jnp.array([0.9]), jnp.array([0.0]))
     path = fine.replay(bare, begun, jnp.zeros((20000, 1))).physics
     measured = 3000 - round(delay / 1e-4)
     augmented = with_effects(base, [(EFFECTS["sensor_delay"], "joint/hinge/qpos")], Scales())
-    start = (float(x[0][measured]) for x in (path.qpos, path.qvel))
+    start = float(path.qpos[0][measured]), float(path.qvel[0][3000 if prompt else measured])
     seen = simulate(augmented, np.zeros((100, 1)), *start)(jnp.array([delay]))
     assert np.abs(seen[:, 0] - path.qpos[0][measured + 100 * np.arange(1, 101)]).max() < 0.01
 
