@@ -179,7 +179,7 @@ def resumed(
                 path = Path(folder) / "case"
                 try:
                     sealed = make_drawn(path, case)
-                except StrengthError as error:
+                except (StrengthError, AbsorbedError) as error:
                     print(f"{'not made':<12} {case['rig']} {error}", flush=True)
                     continue
                 start = time.perf_counter()
@@ -292,7 +292,7 @@ def summarize(rows: list[dict[str, Any]]) -> str:
         parts.append(f"library without abstention: wrong in {sum(_is_wrong(row) for row in members)}")
         lines.append(f"{group:<8} {len(members):>4}: {', '.join(parts)}")
     absorbed = [
-        row for row in rows if row["outcome"] == "missed" and row["nrmse"]["baseline"] < 1.1 * row["noise_floor"]
+        row for row in rows if row["outcome"] == "missed" and row["nrmse"]["baseline"] < ABSORBED * row["noise_floor"]
     ]
     if absorbed:
         lines.append(f"of those missed, {len(absorbed)} predict within a tenth of the noise without the effect")
