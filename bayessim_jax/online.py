@@ -325,7 +325,7 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
     )
     q = setup.estimator.posterior(estimator, history, use)
     posterior = setup.proposal.combine(state.belief, proposal, q)
-    growth, gap = _compare(state.belief, posterior)
+    growth, gap = posterior.against(state.belief)
     # a fit that says less than was known, and does not contradict it, leaves the belief
     uninformed = setup.proposal.accumulate & (growth > jnp.log(1.2)) & (gap < 2.0 * thetas.shape[1])
     stays = recordings.diverged.all() | uninformed
@@ -430,10 +430,3 @@ def _agree(setup: Setup, estimator: Any, history: Recording, newest: Array) -> B
 def _rows(leaf: Array) -> Array:
     """Join the first two axes, also where another one is empty (a machine without actuators)."""
     return leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:])
-
-
-def _compare(old: Truncated, new: Truncated) -> tuple[Scalar, Scalar]:
-    """The log of the new volume over the old one, and the squared distance of the means in units of the new width."""
-    after, gap = new.covariance(), new.mean() - old.mean()
-    log_ratio = 0.5 * (jnp.linalg.slogdet(after)[1] - jnp.linalg.slogdet(old.covariance())[1])
-    return log_ratio, gap @ jnp.linalg.solve(after, gap)

@@ -110,6 +110,12 @@ class Truncated:
         """Cov θ of the truncated law."""
         return self.scatter
 
+    def against(self, before: Truncated) -> tuple[Scalar, Scalar]:
+        """The log of its volume over an earlier belief's, and the squared distance of their means in its own widths."""
+        after, gap = self.covariance(), self.mean() - before.mean()
+        log_ratio = 0.5 * (jnp.linalg.slogdet(after)[1] - jnp.linalg.slogdet(before.covariance())[1])
+        return log_ratio, gap @ jnp.linalg.solve(after, gap)
+
     def loosen(self, share: float | Scalar) -> Truncated:
         """(1 − share) p + share U(θ; box): θ may have been drawn anew from the prior, with that probability."""
         flat = Truncated.uniform(self.box, self.log_shares.size)
