@@ -24,9 +24,9 @@ class Infer:
     """The case: a folder with a case.toml."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
     """Run folder to make; runs/CASE-infer by default."""
-    method: Literal["direct", "laplace"] = "direct"
-    """direct: the likelihood, written down, with a sampler that corrects Laplace's approximation; laplace: that
-    approximation alone."""
+    method: Literal["direct", "amortised", "laplace"] = "direct"
+    """direct: the likelihood, written down, with a sampler that corrects Laplace's approximation; amortised: networks
+    that learn from simulations of the recordings' windows; laplace: that approximation alone."""
     engine: Literal["auto", "tree", "mujoco", "mjx"] = "auto"
     """What steps the model."""
     mask: bool = False
@@ -62,9 +62,10 @@ def infer(words: Sequence[str]) -> int:
         from bayessim_jax.recordings.results import write_inference
         from bayessim_jax.report.infer import headline, render
 
+        run.facts["method"] = command.method
         model = run.model(engine=command.engine)
-        exact = command.method == "direct"
-        result = infer_case(jax.random.key(command.seed), model, exact=exact, draws=command.draws, say=run.say)
+        key, options = jax.random.key(command.seed), {"method": command.method, "draws": command.draws}
+        result = infer_case(key, model, **options, say=run.say)
         write_inference(run.folder, result, command.seed)
         run.conclude(render(result, run.facts), [headline(result)])
     return run.code

@@ -15,13 +15,13 @@ import blackjax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from bayessim_jax.beliefs.margins import Margins
+from bayessim_jax.inference.draws import PosteriorDraws
 from bayessim_jax.inference.shooting import Fit, Predict, Ridge, Shots, profile, residuals, ridge, solve
 
-__all__ = ["DirectPosterior", "estimate_noise", "fit_direct", "sample_direct"]
+__all__ = ["estimate_noise", "fit_direct", "sample_direct"]
 
 SCREENED = 48
 """Draws of the prior that are simulated once to find where to begin."""
@@ -39,23 +39,6 @@ WIDE = 20.0
 """Precision below which a direction is wide: a standard deviation of 0.22 of the prior's."""
 WALK, STRIDE, STEPS = 40, 0.2, 15
 """Most steps of a profile to each side, their length in z, and steps of the solver at each."""
-
-
-@struct.dataclass
-class DirectPosterior:
-    """Draws of θ, the fit they surround, and how far Laplace's approximation was from them."""
-
-    draws: Float[Array, "draws d"]
-    """In raw units."""
-    z: Float[Array, "draws d"]
-    fit: Fit
-    efficiency: float = struct.field(pytree_node=False)
-    """Effective share of Laplace's draws as an importance sample: 1 where the posterior is Gaussian in z."""
-    sampler: str = struct.field(pytree_node=False)
-
-    def marginal(self, d: int) -> DirectPosterior:
-        """Of the first d parameters alone."""
-        return dataclasses.replace(self, draws=self.draws[:, :d], z=self.z[:, :d], fit=self.fit.marginal(d))
 
 
 LEAST_SHARE = 0.1
@@ -173,7 +156,7 @@ def sample_direct(
     draws: int = 2000,
     step: float = 0.0,
     exact: bool = True,
-) -> DirectPosterior:
+) -> PosteriorDraws:
     """Draw θ from the posterior: Laplace's draws, weighed by the likelihood; where too few are worth anything, chains.
 
     The proposal is Student's t with 7 degrees of freedom around the optimum. Where the posterior is wide along some
@@ -184,7 +167,7 @@ def sample_direct(
     factor = jnp.linalg.inv(jnp.linalg.cholesky(fit.precision)).T
     if not exact:
         z = fit.z + jax.random.normal(key, (draws, d)) @ factor.T
-        return DirectPosterior(jax.vmap(margins.theta)(z), z, fit, float("nan"), "laplace")
+        return PosteriorDraws(jax.vmap(margins.theta)(z), z, fit, "laplace")
     t_key, pick_key, chain_key = jax.random.split(key, 3)
     nu = 7.0
     normal_key, chi_key = jax.random.split(t_key)
@@ -204,14 +187,14 @@ def sample_direct(
         z = points[jax.random.choice(pick_key, DRAWS, (draws,), p=share)]
         jitter = SMOOTH * jax.random.normal(chain_key, (draws, d)) @ factor.T
         z = center + (z + jitter - center) / np.sqrt(1 + SMOOTH**2)
-        return DirectPosterior(jax.vmap(margins.theta)(z), z, fit, efficiency, "laplace, weighed")
+        return PosteriorDraws(jax.vmap(margins.theta)(z), z, fit, "laplace, weighed", efficiency)
     if d > 1 and float(jnp.linalg.eigvalsh(fit.precision)[0]) < WIDE:
         z = _walk(pick_key, predict, shots, fit, draws, step)
-        return DirectPosterior(jax.vmap(margins.theta)(z), z, fit, efficiency, "profile along the widest direction")
+        return PosteriorDraws(jax.vmap(margins.theta)(z), z, fit, "profile along the widest direction", efficiency)
     first = points[jax.random.choice(pick_key, DRAWS, (CHAINS,), p=weight / weight.sum())]
     z = _chains(chain_key, predict, shots, around, first, factor)
     z = z.reshape(-1, d)[:: max(z.size // d // draws, 1)]
-    return DirectPosterior(jax.vmap(margins.theta)(z), z, fit, efficiency, "random-walk Metropolis")
+    return PosteriorDraws(jax.vmap(margins.theta)(z), z, fit, "random-walk Metropolis", efficiency)
 
 
 def _walk(

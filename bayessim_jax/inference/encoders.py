@@ -17,7 +17,16 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from bayessim_jax.contracts import Recording
 from bayessim_jax.spelling import find_named
 
-__all__ = ["ENCODERS", "Encoder", "Features", "Lstm", "features_of", "lookup_encoder", "transition_features"]
+__all__ = [
+    "ENCODERS",
+    "Encoder",
+    "Features",
+    "Lstm",
+    "Windowed",
+    "features_of",
+    "lookup_encoder",
+    "transition_features",
+]
 
 Features = Callable[[Recording], Float[Array, "steps features"]]
 """What an encoder reads of every transition of a recording; zero where it did not happen."""
@@ -174,6 +183,37 @@ def _lstm_backward(residuals: Any, dmean: Array) -> tuple[Array, Array, None]:
 
 
 _lstm.defvjp(_lstm_forward, _lstm_backward)
+
+
+@struct.dataclass
+class Windowed:
+    """A set of windows that share θ, laid end to end in one sequence: the mean of their embeddings, and of their rows.
+
+    Every window is read by itself by the same encoder, so that their order is nothing and what one network learns of a
+    window it knows of all. The means of the features stand beside: what is linear in them needs no learning.
+
+    Source: Zaheer et al. 2017
+    """
+
+    each: Encoder = struct.field(pytree_node=False)
+    windows: int = struct.field(pytree_node=False)
+
+    def init(self, key: PRNGKeyArray, features: int) -> Any:
+        """Those of the encoder of a window."""
+        return self.each.init(key, features)
+
+    def apply(
+        self, params: Any, x: Float[Array, "batch steps features"], valid: Bool[Array, "batch steps"]
+    ) -> Float[Array, "batch size"]:
+        """Means over windows that hold a valid step, and over all valid steps."""
+        split = lambda leaf: leaf.reshape(x.shape[0] * self.windows, -1, *leaf.shape[2:])  # noqa: E731
+        there = split(valid).any(-1).reshape(x.shape[0], self.windows)
+        embedded = self.each.apply(params, split(x), split(valid)).reshape(*there.shape, -1)
+        return jnp.concatenate([_mean(embedded, there), _mean(x, valid)], axis=-1)
+
+
+def _mean(x: Float[Array, "batch steps size"], valid: Bool[Array, "batch steps"]) -> Float[Array, "batch size"]:
+    return jnp.where(valid[..., None], x, 0.0).sum(1) / jnp.maximum(valid.sum(1), 1)[:, None]
 
 
 ENCODERS: dict[str, Encoder] = {"pooled_lstm": Lstm(size=32, widths=(32, 32), frame=10), "lstm": Lstm()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from bayessim_jax.inference.direct import DirectPosterior, sample_direct
+from bayessim_jax.inference.amortised import sample_amortised
+from bayessim_jax.inference.direct import sample_direct
+from bayessim_jax.inference.draws import PosteriorDraws
 from bayessim_jax.inference.identifiability import Identifiability, find_unidentified
 from bayessim_jax.inference.replay import Restarted
 from bayessim_jax.inference.scores import (
@@ -27,9 +30,12 @@ from bayessim_jax.inference.shooting import Fit, Shots, ridge
 from bayessim_jax.recordings.shots import CaseModel, predictor, split_windows
 from bayessim_jax.recordings.stepping import settle_step
 from bayessim_jax.recordings.windows import Windows
+from bayessim_jax.spelling import near_miss
 
-__all__ = ["CaseInference", "channel_scale", "infer_case", "start_spread"]
+__all__ = ["METHODS", "CaseInference", "channel_scale", "infer_case", "start_spread"]
 
+METHODS = ("direct", "amortised", "laplace")
+"""By the likelihood, written down; by networks that learn from simulations; by Laplace's approximation alone."""
 DRAWS = 2000
 BAND = 24
 """Posterior draws whose predictions make the band around the recording."""
@@ -40,7 +46,9 @@ class CaseInference:
     """A posterior over a case's parameters, and how the simulator predicts with it and without it."""
 
     model: CaseModel
-    posterior: DirectPosterior
+    method: str
+    """One of `METHODS`."""
+    posterior: PosteriorDraws
     fitted: Windows
     """Windows that the posterior is of."""
     held_out: Windows
@@ -91,7 +99,9 @@ class CaseInference:
             },
             "identifiability": self.identifiability.as_table(),
             "engine": {"name": self.model.engine_name, "reason": self.model.system.reason},
+            "method": self.method,
             "sampler": self.posterior.sampler,
+            "calibration": None if self.posterior.coverage is None else self.posterior.coverage.as_table(),
         }
 
 
@@ -111,18 +121,26 @@ def start_spread(model: CaseModel, fit: Fit) -> Float[np.ndarray, " n"]:
     return found
 
 
+def restarted_shots(shots: Shots, spread: Float[np.ndarray, " n"]) -> Shots:
+    """Windows given their first rows: initial states as recorded, off by as much as those are; the rest is compared."""
+    return dataclasses.replace(shots, spread=jnp.asarray(spread), measured=shots.measured.at[:, 0].set(False))
+
+
 def infer_case(
     key: Array,
     model: CaseModel,
     *,
-    exact: bool = True,
+    method: str = "direct",
     draws: int = DRAWS,
     say: Callable[[str], None] = lambda text: None,
 ) -> CaseInference:
-    """Infer a case's parameters by their likelihood; raises `ValueError` where nothing can be simulated.
+    """Infer a case's parameters by one of `METHODS`; raises `ValueError` where nothing can be simulated.
 
-    Windows of held-out recordings (of held-out stretches, where there is one recording) take no part in the fit.
+    Windows of held-out recordings (of held-out stretches, where there is one recording) take no part in the fit. All
+    methods share the estimate of the noise, of the time step and of how far recorded initial states are off.
     """
+    if method not in METHODS:
+        raise ValueError(f"unknown method {method!r}: {near_miss(method, METHODS)}")
     fit_key, draw_key = jax.random.split(key)
     fitted, held = split_windows(model)
     say(f"fitting {len(fitted)} windows of {model.case.case.horizon:g} s; {len(held)} are kept to judge by")
@@ -130,8 +148,14 @@ def infer_case(
     model = settled.model
     predict, shots, left = predictor(model), model.shots(fitted), model.shots(held)
     say("sampling the posterior")
-    wide = (settled.predict, settled.shots, settled.margins, settled.fit)
-    posterior = sample_direct(draw_key, *wide, draws=draws, step=model.step, exact=exact).marginal(model.margins.size)
+    about, options = (settled.margins, settled.fit), {"draws": draws, "step": model.step}
+    if method == "amortised":
+        seen = restarted_shots(settled.shots, start_spread(model, settled.fit))
+        commands = jnp.asarray(fitted.ctrl)
+        wide = sample_amortised(draw_key, settled.predict, seen, *about, commands, **options, say=say)
+    else:
+        wide = sample_direct(draw_key, settled.predict, settled.shots, *about, **options, exact=method == "direct")
+    posterior = wide.marginal(model.margins.size)
     say("predicting held-out windows")
     prior_mean = jnp.asarray([p.prior.mean for p in model.case.parameters])
     points = {"baseline": model.margins.standard(prior_mean), "posterior": posterior.z.mean(0)}
@@ -145,6 +169,7 @@ def infer_case(
     band = np.stack([predict_windows(predict, left, z) for z in posterior.z[:: max(draws // BAND, 1)][:BAND]])
     return CaseInference(
         model=model,
+        method=method,
         posterior=posterior,
         fitted=fitted,
         held_out=held,

@@ -53,6 +53,7 @@ def worries(result: CaseInference) -> list[str]:
     after, floor = result.scores["posterior"].nrmse, result.noise_floor
     if not bool(fit.converged):
         found.append("The fit did not converge: the optimum may lie elsewhere.")
+    found.extend(result.posterior.doubts)
     if lost := result.scores["posterior"].diverged:
         found.append(f"{lost} held-out windows diverged in simulation; they are in no average.")
     if np.isfinite(floor) and after > 2 * floor:
@@ -217,6 +218,17 @@ def _residuals(result: CaseInference) -> tuple[str, str, str]:
     return svg, "Residuals against lead time and against the state.", caption
 
 
+def _trust(result: CaseInference) -> list[list[str]]:
+    """What the way in which the posterior was drawn says of itself."""
+    rows, coverage = [], result.posterior.coverage
+    if result.posterior.efficiency is not None:
+        rows.append(["effective share of Laplace's draws", number(result.posterior.efficiency)])
+    if coverage is not None:
+        held = f"{100 * coverage.half:.0f} % and {100 * coverage.most:.0f} % of {coverage.sets}"
+        rows.append(["truths in the 50 % and 90 % sets of simulated recordings", held])
+    return rows
+
+
 def _settings(result: CaseInference, facts: Mapping[str, Any]) -> str:
     noise = [
         [c, number(s, 4)] for c, s in zip(result.model.channels, np.asarray(result.posterior.fit.sigma), strict=True)
@@ -224,7 +236,7 @@ def _settings(result: CaseInference, facts: Mapping[str, Any]) -> str:
     rows = [
         ["engine", result.model.system.reason],
         ["sampler", result.posterior.sampler],
-        ["effective share of Laplace's draws", number(result.posterior.efficiency)],
+        *_trust(result),
         ["windows fitted, held out", f"{len(result.fitted)}, {len(result.held_out)}"],
         ["held out", ", ".join(result.held_out_names)],
         *[[str(k), str(v)] for k, v in facts.items() if isinstance(v, (str, int, float))],

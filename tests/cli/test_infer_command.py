@@ -41,6 +41,28 @@ def test_the_run_folder_holds_what_was_learned(run):
         assert {"prior", "posterior", "posterior_predictive", "observed_data"} <= set(tree.children)
 
 
+def test_networks_leave_the_same_files_and_say_how_they_were_judged(run):
+    folder, _ = run
+    words = ["infer", str(folder / "rig"), "--out", str(folder / "networks"), "--method", "amortised", "--quiet"]
+    assert main(words) == 0
+    files = [{p.name for p in (folder / name).iterdir()} for name in ("run", "networks")]
+    assert files[0] == files[1]
+    direct, found = (json.loads((folder / name / "inference.json").read_text()) for name in ("run", "networks"))
+    assert set(direct) == set(found) and (direct["method"], found["method"]) == ("direct", "amortised")
+    assert json.loads((folder / "networks" / "run.json").read_text())["method"] == "amortised"
+    theirs, ours = direct["parameters"]["carriage_mass"], found["parameters"]["carriage_mass"]
+    assert ours["mean"] == pytest.approx(theirs["mean"], abs=theirs["sd"])
+    assert 0.8 * theirs["sd"] < ours["sd"] < 1.6 * theirs["sd"]
+    assert direct["calibration"] is None
+    assert found["calibration"]["coverage50"] == pytest.approx(0.5, abs=0.15)
+    assert found["calibration"]["coverage90"] == pytest.approx(0.9, abs=0.1)
+    assert found["fit"]["held_out"] == direct["fit"]["held_out"]
+    with xr.open_datatree(folder / "networks" / "posterior.nc", engine="h5netcdf") as tree:
+        drawn = tree["posterior"]["carriage_mass"]
+        assert ((drawn.values > drawn.attrs["prior_low"]) & (drawn.values < drawn.attrs["prior_high"])).all()
+    assert "of simulated recordings" in (folder / "networks" / "report.html").read_text()
+
+
 def test_the_model_comes_out_with_the_mean_in_it(run):
     folder, _ = run
     mean = json.loads((folder / "run" / "inference.json").read_text())["parameters"]["carriage_mass"]["mean"]
@@ -58,11 +80,17 @@ def test_a_used_folder_and_slips_are_refused_in_one_line(run, capsys):
     assert main(["infer", str(folder / "rig"), "--out", str(folder / "run")]) == 2
     assert (folder / "run" / "inference.json").read_bytes() == before
     assert main(["infer", str(folder / "rig"), "--metod", "direct"]) == 2
+    assert main(["infer", str(folder / "rig"), "--method", "amortized", "--out", str(folder / "other")]) == 2
     assert main(["infer", str(folder / "nowhere")]) == 2
     assert main(["infer", str(folder / "rig"), "--draws", "3", "--out", str(folder / "other")]) == 2
     told = capsys.readouterr().err.strip().splitlines()
-    assert len(told) == 4
-    assert "already used" in told[0] and "--method" in told[1] and not (folder / "other").exists()
+    assert len(told) == 5
+    assert (
+        "already used" in told[0]
+        and "--method" in told[1]
+        and "'amortised'" in told[2]
+        and not (folder / "other").exists()
+    )
 
 
 def test_the_report_is_one_page_that_shows_everything(run):

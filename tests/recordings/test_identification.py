@@ -19,8 +19,14 @@ def in_double_precision():
     jax.config.update("jax_enable_x64", False)
 
 
-def inferred(folder, seed=0, **options):
-    return infer_case(jax.random.key(seed), case_model(load_case(folder).check(), **options))
+def inferred(folder, seed=0, method="direct", **options):
+    return infer_case(jax.random.key(seed), case_model(load_case(folder).check(), **options), method=method)
+
+
+def test_an_unknown_method_is_answered_with_the_near_miss(tmp_path):
+    make_case(tmp_path / "rig", "slide", seed=3, recordings=2, seconds=1.0)
+    with pytest.raises(ValueError, match="unknown method 'amortized': did you mean 'amortised'"):
+        inferred(tmp_path / "rig", method="amortized")
 
 
 def test_parameters_noise_and_predictions_of_a_pendulum(tmp_path):
@@ -111,14 +117,28 @@ def test_a_registered_system_is_restarted_from_its_observations(tmp_path):
 
 
 @pytest.mark.slow
-def test_credible_sets_of_many_worlds_hold_the_truth_as_often_as_they_say(tmp_path):
+@pytest.mark.parametrize(("method", "worlds"), [("direct", 30), ("amortised", 15)])
+def test_credible_sets_of_many_worlds_hold_the_truth_as_often_as_they_say(tmp_path, method, worlds):
     levels = []
-    for seed in range(30):
+    for seed in range(worlds):
         folder = tmp_path / f"rig{seed}"
         sealed = make_case(folder, "slide", seed=seed, recordings=2, seconds=2.0)
-        draws = np.asarray(inferred(folder, seed).posterior.draws)[:, 0]
+        draws = np.asarray(inferred(folder, seed, method).posterior.draws)[:, 0]
         levels.append((draws < sealed["parameters"]["carriage_mass"]).mean())
         jax.clear_caches()  # every world compiles programs of its own
     central = np.abs(2 * np.array(levels) - 1)
     assert 0.25 <= (central < 0.5).mean() <= 0.75, sorted(central)
     assert (central < 0.9).mean() >= 0.75, sorted(central)
+
+
+@pytest.mark.slow
+def test_networks_name_what_the_recordings_do_not_inform(tmp_path):
+    folder = tmp_path / "rig"
+    make_case(folder, "slide", seed=6)
+    text = (folder / "case.toml").read_text()
+    text += '\n[[parameters]]\nname = "lift"\ntargets = ["body/carriage/ipos/2"]\n'
+    text += 'prior = { distribution = "uniform", low = -0.1, high = 0.1 }\n'
+    (folder / "case.toml").write_text(text)
+    found = inferred(folder, method="amortised")
+    assert found.identifiability.not_informed == ["lift"]
+    assert found.posterior.z[:, 1].std() == pytest.approx(1.0, abs=0.2)
