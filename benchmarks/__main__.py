@@ -70,7 +70,9 @@ def main() -> None:
     identification.add_argument("--cases", type=int, default=50)
     identification.add_argument("--seed", type=int, default=0)
     identification.add_argument("--finer", type=int, default=4, help="times that the machines' time step is shorter")
+    identification.add_argument("--method", choices=("direct", "amortised", "laplace"), default="direct")
     identification.add_argument("--out", type=Path, help="file of JSON lines to append cases to, and to resume from")
+    identification.add_argument("--beside", type=Path, help="such a file of another method, to compare with")
 
     thresholds = commands.add_parser("thresholds", help="diagnoses with the whole family of the effect left out")
     thresholds.add_argument(

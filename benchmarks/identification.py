@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-__all__ = ["MODELS", "draw_clean", "identify_clean", "ranks", "summarize"]
+__all__ = ["MODELS", "compare_methods", "draw_clean", "identify_clean", "ranks", "summarize"]
 
 MODELS = ("pendulum", "slide", "double", "cart", "arm3")
 NOISE = 1.0
@@ -43,9 +45,15 @@ def ranks(draws: np.ndarray, truth: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def identify_clean(options: Namespace) -> None:
-    """Infer the cases that are not in the file yet, with both, and print the table of all."""
+    """Infer the cases that are not in the file yet, by one method, and print the table of all.
+
+    The peer estimates beside `direct` alone; with `beside`, a file of another method's records, both are compared.
+    """
     jax.config.update("jax_enable_x64", True)
-    peer: dict[str, Callable[..., Any] | None] = {}
+    others = _read(options.beside) if options.beside else []
+    if options.out and options.out.exists() and {row["method"] for row in _read(options.out)} - {options.method}:
+        raise SystemExit(f"{options.out} holds cases of another method; give another --out.")
+    peer: dict[str, Callable[..., Any] | None] = {} if options.method == "direct" else {"identify": None}
     compiled: set[str] = set()
 
     def make(path: Path, case: dict[str, Any]) -> dict[str, Any]:
@@ -53,7 +61,7 @@ def identify_clean(options: Namespace) -> None:
             peer["identify"] = _find_peer()
         first = case["rig"] not in compiled
         compiled.add(case["rig"])
-        return {"first": first, **_infer(path, case, peer["identify"])}
+        return {"method": options.method, "first": first, **_infer(path, case, options.method, peer["identify"])}
 
     rows = []
     with fresh_cache():
@@ -68,6 +76,13 @@ def identify_clean(options: Namespace) -> None:
                 flush=True,
             )
     print("\n" + summarize(rows))
+    if others:
+        print("\n" + compare_methods(rows, others))
+
+
+def _read(path: Path) -> list[dict[str, Any]]:
+    """Records of cases; those that name no method are of the direct one."""
+    return [{"method": "direct", **json.loads(line)} for line in path.read_text(encoding="utf-8").splitlines()]
 
 
 def _find_peer() -> Callable[..., Any] | None:
@@ -82,10 +97,8 @@ def _find_peer() -> Callable[..., Any] | None:
     return identify
 
 
-def _infer(path: Path, case: dict[str, Any], peer: Callable[..., Any] | None) -> dict[str, Any]:
+def _infer(path: Path, case: dict[str, Any], method: str, peer: Callable[..., Any] | None) -> dict[str, Any]:
     """The posterior of a case, the peer's estimate on the windows it was fitted to, and the seconds of both."""
-    import json
-
     from bayessim_jax.recordings.concealing import SEALED
     from bayessim_jax.recordings.identification import infer_case
     from bayessim_jax.recordings.loading import load_case
@@ -93,7 +106,7 @@ def _infer(path: Path, case: dict[str, Any], peer: Callable[..., Any] | None) ->
 
     model = case_model(load_case(path).check())
     with watch_compilation() as compilation:
-        seconds, found = stopwatch(infer_case, jax.random.key(case["seed"]), model)
+        seconds, found = stopwatch(partial(infer_case, method=method), jax.random.key(case["seed"]), model)
     jax.clear_caches()
     estimate, peer_seconds = peer(model, found.fitted) if peer else (None, None)
     truths = json.loads((path / SEALED).read_text(encoding="utf-8"))["parameters"]
@@ -149,19 +162,59 @@ def summarize(rows: list[dict[str, Any]]) -> str:
     return "\n".join([*lines, *([_line("all", rows)] if len(rigs) > 1 else [])])
 
 
-def _line(name: str, rows: list[dict[str, Any]]) -> str:
+METHODS_HEAD = """\
+| method | cases | joint 50 % | 90 % | numbers | each 50 % | 90 % | error | sd over {}'s | s | first | again |
+|---|---|---|---|---|---|---|---|---|---|---|---|"""
+
+
+def compare_methods(rows: list[dict[str, Any]], others: list[dict[str, Any]]) -> str:
+    """A line for each of two methods on the cases that both have.
+
+    Errors are medians in standard deviations of the priors; of the posteriors' standard deviations over the other
+    method's the median and the quartiles over numbers; the rest is as in `summarize`.
+    """
+    theirs = {row["case"]["seed"]: row for row in others}
+    pairs = [(row, theirs[seed]) for row in rows if (seed := row["case"]["seed"]) in theirs]
+    if any(row["case"] != other["case"] for row, other in pairs) or not pairs:
+        raise SystemExit("the two files are not of the same cases; choose the same --seed, --rigs and --finer.")
+    reference = [other for _, other in pairs]
+    lines = [METHODS_HEAD.format(reference[0]["method"])]
+    for each in (reference, [row for row, _ in pairs]):
+        ratios = [
+            p["sd"] / other["parameters"][name]["sd"]
+            for row, other in zip(each, reference, strict=True)
+            for name, p in row["parameters"].items()
+        ]
+        low, middle, high = np.quantile(ratios, [0.25, 0.5, 0.75])
+        error = f"{np.median([_error(row, 'mean') for row in each]):.2g}"
+        width = "1" if each is reference else f"{middle:.2f} ({low:.2f} – {high:.2f})"
+        cells = (each[0]["method"], len(each), *_held(each), error, width, *_seconds(each))
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    return "\n".join(lines)
+
+
+def _held(rows: list[dict[str, Any]]) -> tuple[Any, ...]:
+    """Joint coverage at 50 and 90 %, how many single parameters there are, and theirs."""
     rank = np.array([row["rank"] for row in rows])
     below = np.array([p["below"] for row in rows for p in row["parameters"].values()])
-    central = 2 * np.abs(below - 0.5)
-    held = [f"{(x <= level).mean():.2f}" for x in (rank, central) for level in (0.5, 0.9)]
+    joint, each = ([f"{(x <= level).mean():.2f}" for level in (0.5, 0.9)] for x in (rank, 2 * np.abs(below - 0.5)))
+    return (*joint, len(below), *each)
+
+
+def _seconds(rows: list[dict[str, Any]]) -> tuple[str, str, str]:
+    """Medians: without compilation, with it the first time, with it from the cache."""
+    net = np.median([row["ours_seconds"] - row["compile_seconds"] for row in rows])
+    spent = [[row["ours_seconds"] for row in rows if row["first"] == first] for first in (True, False)]
+    first, again = (f"{np.median(each):.1f}" if each else "–" for each in spent)
+    return f"{net:.2f}", first, again
+
+
+def _line(name: str, rows: list[dict[str, Any]]) -> str:
     both = [row for row in rows if row["peer_seconds"] is not None]
     ratio, theirs = "–", "–"
     if both:
         low, middle, high = np.quantile([_error(row, "mean") / _error(row, "peer") for row in both], [0.25, 0.5, 0.75])
         ratio = f"{middle:.2g} ({low:.2g} – {high:.2g})"
         theirs = f"{np.median([row['peer_seconds'] for row in both]):.1f}"
-    net = np.median([row["ours_seconds"] - row["compile_seconds"] for row in rows])
-    spent = [[row["ours_seconds"] for row in rows if row["first"] == first] for first in (True, False)]
-    seconds = (f"{net:.2f}", *(f"{np.median(each):.1f}" if each else "–" for each in spent), theirs)
-    cells = (name, len(rows), *held[:2], len(below), *held[2:], ratio, *seconds)
+    cells = (name, len(rows), *_held(rows), ratio, *_seconds(rows), theirs)
     return f"| {' | '.join(map(str, cells))} |"

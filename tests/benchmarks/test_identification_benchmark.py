@@ -5,20 +5,42 @@ import numpy as np
 import pytest
 
 from benchmarks.compilation import Compilation
-from benchmarks.identification import MODELS, draw_clean, ranks, summarize
+from benchmarks.identification import MODELS, compare_methods, draw_clean, ranks, summarize
 from benchmarks.worlds import RIGS, make_case
 
 ROOT = Path(__file__).parents[2]
 
 
+def records(name, method):
+    lines = (ROOT / "benchmarks" / "results" / name).read_text(encoding="utf-8").splitlines()
+    return [{"method": method, **json.loads(line)} for line in lines]
+
+
 def test_the_table_of_the_docs_is_printed_from_the_records():
-    lines = (ROOT / "benchmarks" / "results" / "identification.jsonl").read_text(encoding="utf-8").splitlines()
-    rows = [json.loads(line) for line in lines]
+    rows = records("identification.jsonl", "direct")
     assert [row["case"] for row in rows] == draw_clean(list(MODELS), len(rows), 0, finer=4)
     docs = (ROOT / "docs" / "identification.md").read_text(encoding="utf-8")
     printed = summarize(rows).splitlines()
     assert len(printed) == 2 + len(MODELS) + 1
     assert [line for line in printed if line not in docs] == []
+
+
+def test_the_table_of_methods_is_printed_from_the_records_of_the_same_cases():
+    direct, networks = records("identification.jsonl", "direct"), records("identification_amortised.jsonl", "amortised")
+    assert {row["method"] for row in networks} == {"amortised"} and len(networks) >= 15
+    assert [row["case"] for row in networks] == [row["case"] for row in direct[: len(networks)]]
+    docs = (ROOT / "docs" / "identification.md").read_text(encoding="utf-8")
+    printed = compare_methods(networks, direct).splitlines()
+    assert len(printed) == 4
+    assert [line for line in printed if line not in docs] == []
+
+
+def test_methods_are_compared_on_the_same_cases_alone():
+    direct = records("identification.jsonl", "direct")
+    other = [row | {"case": row["case"] | {"noise": 3.0}} for row in direct]
+    with pytest.raises(SystemExit, match="not of the same cases"):
+        compare_methods(other, direct)
+    assert "| 1.00 (1.00 – 1.00) |" in compare_methods([row | {"method": "again"} for row in direct[:4]], direct)
 
 
 def test_cases_of_any_number_are_spread_over_the_machines():
