@@ -21,7 +21,6 @@ CONTAINS = {
     "lugre_friction": ("coulomb_friction", "stribeck_friction"),
     "gain_drop": ("actuator_gain",),
     "gain_drift": ("actuator_gain",),
-    "payload": ("link_offset",),
     "joint_flexibility": ("armature",),
     "backlash": ("armature",),
 }

@@ -198,8 +198,9 @@ def eliminate(c: Curvature, damping: Scalar | float = 0.0) -> tuple[Array, Array
     return precision, gradient, toward, shift
 
 
-TOLERANCE, DAMPING = 1e-7, 1e-3
-"""Of the solver: the share of the cost that it ends with, and the damping that it begins with."""
+TOLERANCE, ROUGH, DAMPING = 1e-7, 1e-4, 1e-3
+"""Of the solver: the share of the cost that it ends with, by derivatives and by differences, and the damping that it
+begins with."""
 COMPILER_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
 """For programs of small arrays on a CPU: compilation takes half as long, and what comes out is no slower."""
 
@@ -219,12 +220,14 @@ def solve(
     """Levenberg-Marquardt on (z, δ₁, …, δ_W) from a starting point; z stays as it is where it is not `free`.
 
     A step that does not lower the cost, or leads to a number that is not finite, is refused and shortened. The solver
-    has converged when two accepted steps in a row lower the cost by less than 1e-7 of it, or when no step does.
+    has converged when two accepted steps in a row lower the cost by less than 1e-7 of it (1e-4 where derivatives are
+    differences, as where bodies collide), or when no step does.
     """
     kind = jnp.result_type(z)
     z, delta, sigma = z.astype(kind), delta.astype(kind), sigma.astype(kind)
 
     d, n, windows = z.size, delta.shape[-1], delta.shape[0]
+    tolerance = ROUGH if step else TOLERANCE
     held = jnp.outer(free, free)
     zero = jnp.zeros((), kind)
     nothing = Curvature(
@@ -256,7 +259,7 @@ def solve(
         move = jnp.where(free, jnp.linalg.solve(precision, jnp.where(free, gradient, 0.0)), 0.0)
         move = move * jnp.minimum(1.0, 2.0 / jnp.maximum(jnp.abs(move).max(initial=0.0), 1e-12))
         moves = (shift - toward @ move) * shots.spread
-        small = jnp.where(better & (gain < TOLERANCE), small + 1, jnp.where(better, 0, small))
+        small = jnp.where(better & (gain < tolerance), small + 1, jnp.where(better, 0, small))
         return (z + move, delta + moves), kept, here, damping.astype(kind), count + 1, small
 
     def more(carry: Any) -> Any:

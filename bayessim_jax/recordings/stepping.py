@@ -81,7 +81,7 @@ def settle_step(
     """Fit a case and the time step of what was recorded, with a finer simulation where the model's is too coarse.
 
     The finer simulation is used where the error is not small against the sensors' noise, unless the recordings are
-    explained less well by it.
+    explained less well by it, or derivatives are differences: these cost too much of it.
     """
     margins = model.margins + Margins.create(["time step"], [RATIO])
     shots = model.shots(windows)
@@ -110,7 +110,7 @@ def settle_step(
         base = dataclasses.replace(base, step_error=dataclasses.replace(error, z=found.z[:-1], ratio=ratio))
         return Settled(base, found, predict, seen, margins, max(sd, SURE) * (ahead - behind) / 2e-3 + wild)
 
-    if size > TOLERABLE:
+    if size > TOLERABLE and not model.step:
         finest = case_model(model.case, engine=model.engine_name, before=model.before, refined=REFINED**2)
         wide = StepError((model, finer, finest), fit.z[:-1])
         again = refit(finer, _stepped(predictor(finer), wide.nodes), wide, wide.runs(shots, REFINED, fit.delta))
