@@ -44,6 +44,10 @@ def compare_fetch(options: Namespace) -> None:
     updates = learner.updates * learner.batch / (learner.envs * learner.horizon)
     print(f"training: {Spread.of(training)} control steps/s, {updates:.0f} transitions replayed for each", flush=True)
     if options.peer_steps:
+        from benchmarks.peers import choose_threads, require_peers
+
+        require_peers("torch", "stable_baselines3")
+        print(f"threads of PyTorch: {choose_threads()}", flush=True)
         peer = [_train_peer(options.peer_steps, updates, r) for r in range(options.repeats)]
         print(f"Stable-Baselines3, as many replayed: {Spread.of([p[0] for p in peer])} control steps/s")
         print(f"Stable-Baselines3, as it comes:      {Spread.of([p[1] for p in peer])} control steps/s")

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from trials import gather, resume
 
@@ -90,7 +91,14 @@ def _trial(name: str, scheme: str, args: argparse.Namespace) -> tuple[Callable[[
     def make(index: int) -> dict[str, Any]:
         truth_key, run_key = jax.random.split(jax.random.fold_in(jax.random.key(args.seed), index))
         truth = jax.random.uniform(truth_key, box.low.shape, minval=box.low, maxval=box.high)
-        _, infos = run(run_key, setup, gymnasium_target(name, truth, system.noise), rounds=args.rounds)
+        target = gymnasium_target(name, truth, system.noise)
+        state, done = online.init(online.split(run_key).init, setup), []
+        for number in range(1, args.rounds + 1):
+            state, info = run(run_key, setup, target, state, rounds=1)
+            done.append(jax.tree.map(np.asarray, info))
+            success = float(info.success_target[0])
+            print(f"{name} {scheme} round {number}: success {success:.2f}".ljust(60), end="\r", flush=True)
+        infos = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *done)
         log_q = jax.vmap(lambda belief: belief.log_prob(truth))(infos.belief)
         found = {"success": infos.success_target, "return": infos.return_target, "log_q": log_q, "truth_values": truth}
         return jax.tree.map(np.asarray, found)

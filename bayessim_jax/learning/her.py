@@ -25,6 +25,8 @@ from bayessim_jax.learning.replay import Replay
 __all__ = ["Her", "HerInfo", "HerState"]
 
 _ADAM = optax.scale_by_adam()
+AHEAD = 10
+"""Steps within which something must move for a transition to be replayed often."""
 
 
 @struct.dataclass
@@ -59,7 +61,7 @@ class Her:
     """Maximizes E Σ γᵗ rₜ for the goal of each episode, learning from every episode as if it had asked for what it got.
 
     With probability `relabelled` a transition is replayed with a goal that its own episode achieved at this step or
-    later. A deterministic policy climbs the critic Q,
+    later; it is replayed more often if something is about to move (`idle`). A deterministic policy climbs the critic Q,
 
         max Σ Q(y, π(y)) − penalty |π(y)|²,   Q(y, u) ← r + γ min Q'(y', π'(y')),
 
@@ -82,7 +84,7 @@ class Her:
     """Fraction of the way that the slow networks follow in one gradient step."""
     relabelled: Scalar
     idle: Scalar
-    """How often an episode is replayed in which nothing was moved, to one in which something was; 1 for evenly."""
+    """How often a transition is replayed that nothing moves after, to one that much does; 1 for evenly."""
     penalty: Scalar
     smoothing: Scalar
     """Standard deviation of the noise on the target's action, in half-widths; it is clipped at 2.5 of them."""
@@ -112,7 +114,7 @@ class Her:
         slowness: float = 0.05,
         relabelled: float = 0.8,
         idle: float = 0.05,
-        penalty: float = 1.0,
+        penalty: float = 0.5,
         deviation: float = 0.2,
         random: float = 0.3,
         critics: int = 1,
@@ -217,7 +219,7 @@ class Her:
         goal, achieved = jnp.array(self.task.goal), jnp.array(self.task.achieved)
         sample_key, choice_key = jax.random.split(key)
         size = (self.updates, self.batch)
-        rows, later = state.replay.sample_later(sample_key, size, self._weights(state.replay))
+        rows, later = state.replay.sample_later(sample_key, size, self._weights(state.replay), self.horizon)
         before, action = rows[..., :obs], rows[..., obs : obs + act]
         after, sound = rows[..., obs + act : -1], rows[..., -1]
         hindsight = jax.random.bernoulli(choice_key, self.relabelled, size)
@@ -229,13 +231,20 @@ class Her:
         return before, action, after, reward, sound
 
     def _weights(self, replay: Replay) -> Array:
-        """What moved as far as the mean episode's counts 1; what stayed where it was counts `idle`."""
-        start = self.system.observations.size + self.head.box.size
-        columns = start + jnp.array(self.task.achieved)
-        episodes = replay.table.reshape(-1, self.horizon, replay.table.shape[1])[:, :, columns]
-        moved = jnp.linalg.norm(episodes[:, -1] - episodes[:, 0], axis=-1)
-        mean = jnp.sum(moved) * self.horizon / jnp.maximum(replay.filled, 1)
-        return self.idle + (1.0 - self.idle) * jnp.minimum(moved / jnp.maximum(mean, 1e-9), 1.0)
+        """How often each row is replayed: 1 where much moves within the next steps, `idle` where nothing does.
+
+        It is the squared way of what is achieved, over the next `AHEAD` steps, less what the sensors' noise alone
+        exceeds in one of a thousand, over its mean. The last rows of an episode share its last `AHEAD` steps.
+        """
+        obs, act, achieved = self.system.observations.size, self.head.box.size, jnp.array(self.task.achieved)
+        episodes = replay.table.reshape(-1, self.horizon, replay.table.shape[1])
+        ahead = min(AHEAD, self.horizon)
+        first = jnp.minimum(jnp.arange(self.horizon), self.horizon - ahead)
+        now, later = episodes[:, first][..., achieved], episodes[:, first + ahead - 1][..., obs + act + achieved]
+        noise = 32.0 * jnp.max(self.system.noise[achieved]) ** 2
+        moved = jnp.maximum(jnp.sum((later - now) ** 2, -1) - noise, 0.0).ravel()
+        mean = jnp.sum(moved) / jnp.maximum(replay.filled, 1)
+        return self.idle + (1.0 - self.idle) * jnp.minimum(moved / jnp.maximum(mean, 1e-12), 1.0)
 
     def _act(self, weights: Any, seen: Any) -> Any:
         outputs: Any = self.network.apply(weights, seen)

@@ -38,21 +38,18 @@ class Replay:
         )
 
     def sample_later(
-        self, key: PRNGKeyArray, batch: tuple[int, ...], weights: Float[Array, " episodes"]
+        self, key: PRNGKeyArray, batch: tuple[int, ...], weights: Float[Array, " capacity"], length: int
     ) -> tuple[Float[Array, "*batch width"], Float[Array, "*batch width"]]:
-        """Rows of episodes drawn by their weights, and for each one drawn evenly from itself and those after it.
+        """Rows drawn by their weights, and for each a row drawn evenly from itself and those after it in its episode.
 
-        Episodes are blocks of equal length that fill the table.
+        Episodes are blocks of `length` rows that fill the table.
         """
-        length = self.table.shape[0] // weights.size
-        episode_key, row_key, later_key = jax.random.split(key, 3)
-        held = jnp.where(jnp.arange(weights.size) * length < self.filled, weights, 0.0)
-        heaped = jnp.cumsum(held)
-        picks = heaped[-1] * jax.random.uniform(episode_key, (math.prod(batch),))
-        episode = jnp.clip(jnp.searchsorted(heaped, picks, side="right"), 0, weights.size - 1)
-        row = jax.random.randint(row_key, episode.shape, 0, length)
-        left = (length - row) * jax.random.uniform(later_key, row.shape)
-        now, later = (self.table[episode * length + r] for r in (row, row + left.astype(row.dtype)))
+        row_key, later_key = jax.random.split(key)
+        heaped = jnp.cumsum(jnp.where(jnp.arange(weights.size) < self.filled, weights, 0.0))
+        picks = heaped[-1] * jax.random.uniform(row_key, (math.prod(batch),))
+        row = jnp.clip(jnp.searchsorted(heaped, picks, side="right"), 0, weights.size - 1)
+        left = (length - row % length) * jax.random.uniform(later_key, row.shape)
+        now, later = (self.table[r] for r in (row, row + left.astype(row.dtype)))
         return now.reshape(*batch, -1), later.reshape(*batch, -1)
 
     def sample(self, key: PRNGKeyArray, batch: tuple[int, ...]) -> Float[Array, "*batch width"]:

@@ -125,16 +125,30 @@ def test_broken_episodes_are_kept_out():
 def test_later_rows_are_of_the_same_episode():
     replay = Replay.create(60, 2)
     rows = jnp.stack([jnp.repeat(jnp.arange(4.0), 10), jnp.tile(jnp.arange(10.0), 4)], -1)
-    now, later = (
-        replay.add(rows[:20])
-        .add(rows[20:])
-        .sample_later(jax.random.key(0), (5000,), jnp.array([1.0, 1.0, 0.0, 2.0, 5.0, 5.0]))
-    )
+    weights = jnp.repeat(jnp.array([1.0, 1.0, 0.0, 2.0, 5.0, 5.0]), 10)
+    replay = replay.add(rows[:20]).add(rows[20:])
+    now, later = replay.sample_later(jax.random.key(0), (5000,), weights, 10)
     np.testing.assert_allclose(np.bincount(now[:, 0].astype(int)) / 5000, [0.25, 0.25, 0.0, 0.5], atol=0.03)
     np.testing.assert_array_equal(now[:, 0], later[:, 0])
     assert (later[:, 1] >= now[:, 1]).all()
     first = later[now[:, 1] == 0, 1]
     np.testing.assert_allclose(np.bincount(first.astype(int), minlength=10) / first.size, 0.1, atol=0.05)
+
+
+def test_what_is_about_to_move_is_replayed_most_and_noise_moves_nothing():
+    """Of two noisy episodes of 30 steps the first stands still, the second goes 0.4 m in its steps 15 and 16."""
+    task = Reach(steps=30)
+    learner = Her.create(plane().replace(noise=jnp.full(4, 1e-3)), task, **(SMALL | {"episodes": 2, "envs": 2}))
+    place = jnp.zeros((2, 31, 2)).at[1, 16, 0].set(0.2).at[1, 17:, 0].set(0.4)
+    seen = jnp.concatenate([place + 1e-3 * jax.random.normal(jax.random.key(0), place.shape), 0 * place], -1)
+    rows = jnp.concatenate([seen[:, :-1], jnp.zeros((2, 30, 2)), seen[:, 1:], jnp.ones((2, 30, 1))], -1)
+    replay = learner.init(jax.random.key(0)).replay.add(rows.reshape(60, -1))
+    still, moving = learner._weights(replay)[:60].reshape(2, 30)
+    idle = float(learner.idle)
+    np.testing.assert_allclose(still, idle)
+    np.testing.assert_allclose(moving[:6], idle)
+    np.testing.assert_allclose(moving[7:16], 1.0)
+    np.testing.assert_allclose(moving[17:], idle)
 
 
 def test_moments_are_those_of_everything_seen():
