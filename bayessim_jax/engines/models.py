@@ -14,7 +14,9 @@ from bayessim_jax.engines.fields import Write, write_into
 __all__ = ["ModelBank"]
 
 BATCHES = 4
-"""Batches of θ whose models are kept."""
+"""Batches of θ whose models are kept, where there is room for them."""
+MEMORY = 1e9
+"""Bytes of models that are kept beside the newest batch's: an arm with meshes takes two million each."""
 
 
 class ModelBank:
@@ -26,6 +28,7 @@ class ModelBank:
         self.others = [w for w in writes if w.field != "geom_size"]
         self.spec = spec
         self.scratch = mujoco.MjData(model)
+        self.room = int(MEMORY / mujoco.mj_sizeModel(model))
         self.rows: OrderedDict[bytes, mujoco.MjModel] = OrderedDict()
         self.batches: OrderedDict[bytes, list[mujoco.MjModel]] = OrderedDict()
         self._check_sizes()
@@ -38,9 +41,10 @@ class ModelBank:
         models = self.batches.get(key)
         if models is None:
             models = [self._row(row) for row in thetas]
-            while len(self.rows) > BATCHES * len(thetas) + 64:
+            kept = min(BATCHES * len(thetas) + 64, max(len(thetas), self.room))
+            while len(self.rows) > kept:
                 self.rows.popitem(last=False)
-            while len(self.batches) >= BATCHES:
+            while self.batches and (len(self.batches) >= BATCHES or self._held() + len(thetas) > self.room):
                 self.batches.popitem(last=False)
             self.batches[key] = models
         self.batches.move_to_end(key)
@@ -53,6 +57,9 @@ class ModelBank:
         write_into(model, self.others, theta)
         mujoco.mj_setConst(model, self.scratch)
         return model
+
+    def _held(self) -> int:
+        return sum(len(models) for models in self.batches.values())
 
     def _row(self, theta: np.ndarray) -> mujoco.MjModel:
         key = theta.tobytes()

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from bayessim_jax.report.beside import Beside
 from bayessim_jax.report.drives import Drives, Scene
 
 if TYPE_CHECKING:
@@ -33,6 +34,8 @@ class OnlineRun:
     drives: Drives | None = None
     """What the target showed, where a planner acted."""
     scene: Scene | None = None
+    beside: Beside | None = None
+    """The newest recording of a target with contacts, and the simulator under the same actions."""
     apparent: Float[np.ndarray, "seed round d"] | None = None
     """θ that the target seems to have, where it is a vehicle that slips."""
 

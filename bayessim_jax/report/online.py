@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from bayessim_jax.report import html
+from bayessim_jax.report.beside import beside_animation
 from bayessim_jax.report.curves import cost_over_rounds, estimates_plot, log_density_plot, return_plot
 from bayessim_jax.report.drives import cost_plot, drive_animation, paths_plot, shown_rounds
 from bayessim_jax.report.evidence import OnlineRun
@@ -37,13 +38,14 @@ def render(run: OnlineRun) -> str:
         *notices,
         *([html.section("Control", *_control(run))] if run.drives else []),
         html.section("Posterior", *_posterior(run)),
+        *([html.section("Target and simulator", beside_animation(run.beside))] if run.beside else []),
         html.section("Over rounds", *_over_rounds(run)),
         *([html.section("Calibration", *_calibration(run))] if run.inferred else []),
         html.section("What to do next", html.commands(_next(run, bool(alarms)))),
         html.section("Settings", _settings(run)),
         f"<footer>{html.escape(_origin(run))}</footer>",
     ]
-    moving = run.scene is not None
+    moving = run.scene is not None or run.beside is not None
     page = "\n".join(body)
     return html.page(name, page, script=script(), script_hash=SCRIPT_HASH) if moving else html.page(name, page)
 

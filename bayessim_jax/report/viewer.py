@@ -103,16 +103,18 @@ for (const root of document.querySelectorAll(".animation")) {
   const data = JSON.parse(root.querySelector("script").textContent), canvas = root.querySelector("canvas");
   const button = root.querySelector("button"), slider = root.querySelector("input");
   let frame = 0, playing = false, last = 0;
-  const frames = data.bodies[0].frames.length; slider.max = frames - 1;
+  const frames = data.time.length; slider.max = frames - 1;
   function draw() {
     const [c, width] = fit(canvas, 340), [x0, y0, x1, y1] = data.box;
     const scale = Math.min((width - 40) / (x1 - x0), 300 / (y1 - y0));
     const X = x => width / 2 + scale * (x - (x0 + x1) / 2), Y = y => 170 - scale * (y - (y0 + y1) / 2);
     for (const body of data.bodies) {
       c.strokeStyle = body.colour || INK(); c.globalAlpha = body.alpha; c.lineWidth = body.width; c.lineCap = "round";
-      for (const [a, b, p, q] of body.frames[frame] || []) {
+      for (const [a, b, p, q] of body.frames[Math.min(frame, body.frames.length - 1)] || []) {
         c.beginPath(); c.moveTo(X(a), Y(b)); c.lineTo(X(p) + (a === p && b === q ? 0.1 : 0), Y(q)); c.stroke(); }
       c.globalAlpha = 1; }
+    c.fillStyle = INK(); c.textAlign = "center";
+    for (const [text, x, y] of data.labels) c.fillText(text, X(x), Y(y));
     c.fillStyle = SOFT; c.textAlign = "left"; c.fillText("t = " + show(data.time[frame]) + " s", 8, 16);
     slider.value = frame;
   }
@@ -180,17 +182,23 @@ def animation(
     bodies: Sequence[tuple[str, str, float, float, np.ndarray]],
     caption: str,
     alt: str = "The model replaying the recording, with simulated ghosts.",
+    labels: Sequence[tuple[str, float, float]] = (),
+    slower: float = 1.0,
 ) -> str:
-    """Stick figures that move: for each a label, a colour, an opacity, a width and segments (frames, segments, 4)."""
-    every = np.concatenate([b[-1].reshape(-1, 2) for b in bodies])
+    """Stick figures that move: for each a label, a colour, an opacity, a width and segments (frames, segments, 4).
+
+    What does not move is one frame. `labels` are words and where they stand; time passes `slower` times as slowly.
+    """
+    every = np.concatenate([*(b[-1].reshape(-1, 2) for b in bodies), *(np.array([label[1:]]) for label in labels)])
     every = every[np.isfinite(every).all(1)]
     low, high = every.min(0), every.max(0)
     pad = 0.06 * max(float((high - low).max()), 1e-3)
     box = [float(x) for x in (*(low - pad), *(high + pad))]
     content = {
         "time": compact(time),
-        "dt": float(np.median(np.diff(time))) if len(time) > 1 else 0.1,
+        "dt": slower * float(np.median(np.diff(time))) if len(time) > 1 else 0.1,
         "box": box,
+        "labels": [list(label) for label in labels],
         "bodies": [
             {"colour": colour, "alpha": alpha, "width": width, "frames": compact(np.nan_to_num(frames), 4)}
             for _, colour, alpha, width, frames in bodies

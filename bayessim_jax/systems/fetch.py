@@ -128,10 +128,15 @@ class Fetch:
         tried = jax.random.uniform(place_key, (CANDIDATES, 2), minval=-layout.scatter, maxval=layout.scatter)
         offset = tried[jnp.argmax(jnp.linalg.norm(tried, axis=1) >= CLEARANCE)]
         centre = jnp.asarray(rest.centre, float)
-        qpos = jnp.asarray(rest.qpos, float).at[rest.object : rest.object + 2].set(centre[:2] + offset)
-        physics = self.engine.init(theta, qpos, jnp.asarray(rest.qvel, float))
         drawn = jax.random.uniform(goal_key, (2,), minval=-layout.spread, maxval=layout.spread)
         goal = centre + jnp.append(drawn + jnp.array([layout.ahead, 0.0]), 0.0)
+        return self.begin(theta, centre[:2] + offset, goal)
+
+    def begin(self, theta: Float[Array, " d"], place: Float[Array, "2"], goal: Float[Array, "3"]) -> FetchState:
+        """The arm at rest, the object at x and y on the table, and a goal, m: where an episode begins."""
+        rest = _build(self.kind)
+        qpos = jnp.asarray(rest.qpos, float).at[rest.object : rest.object + 2].set(place)
+        physics = self.engine.init(theta, qpos, jnp.asarray(rest.qvel, float))
         return FetchState(physics, jnp.asarray(rest.hand, float), goal)
 
     def step(self, theta: Float[Array, " d"], state: FetchState, action: Float[Array, " act"]) -> FetchState:

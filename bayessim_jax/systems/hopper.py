@@ -83,6 +83,11 @@ class Hopper:
             pipeline=pipeline,
         )
 
+    @property
+    def model(self) -> Any:
+        """The MuJoCo model of the same machine, for its shape."""
+        return _load().mj_model
+
     def reset(self, key: PRNGKeyArray, theta: Float[Array, " d"]) -> HopperState:
         """Upright, every coordinate moved by up to 0.005."""
         move = SCATTER * jax.random.uniform(key, (12,), minval=-1.0, maxval=1.0)

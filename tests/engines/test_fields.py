@@ -140,6 +140,25 @@ def test_derived_quantities_follow_masses():
     assert not np.allclose(ours.dof_invweight0, model.dof_invweight0)
 
 
+def test_models_are_kept_while_there_is_room_and_dropped_when_there_is_none():
+    model = mujoco.MjModel.from_xml_string(HOPPER)
+    bank = MujocoEngine(model, merge_writes([find_writes(model, ["body/leg/mass"], 0)])).bank
+    batches = [1.0 + np.arange(3.0)[:, None] + 3 * i for i in range(6)]
+    first = bank.batch(batches[0])
+    for batch in batches[1:3]:
+        bank.batch(batch)
+    assert bank.batch(batches[0]) is first
+    bank.room = 7
+    for batch in batches[1:]:
+        models = bank.batch(batch)
+        np.testing.assert_allclose([m.body("leg").mass[0] for m in models], batch[:, 0])
+    assert len(bank.rows) == 7
+    assert sum(map(len, bank.batches.values())) <= 7
+    large = np.linspace(1.0, 9.0, 12)[:, None]
+    assert len(bank.batch(large)) == len(bank.rows) == 12
+    assert list(bank.batches) == [large.tobytes()]
+
+
 def test_mjx_derives_what_mujoco_derives():
     pytest.importorskip("mujoco.mjx")
     model = mujoco.MjModel.from_xml_string(HOPPER)
