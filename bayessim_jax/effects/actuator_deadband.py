@@ -18,7 +18,7 @@ class ActuatorDeadband(ActEffect):
 
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The width w."""
-        return (EffectParameter("width", "", 0.0, scales.command, 0.0, 0.1 * scales.command),)
+        return (EffectParameter("width", "", 0.0, scales.command, 0.0, 0.1 * scales.command, form=0.01),)
 
     def command(self, values: Values, memory: Memory, command: Any, moment: Moment) -> tuple[Any, Memory]:
         """What of the command is beyond w."""

@@ -20,7 +20,11 @@ class ActuatorRateLimit(ActEffect):
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The rate r; a fit begins at half of what commands as fast as the motion need."""
         rate = scales.command * scales.speed / scales.position
-        return (EffectParameter("rate", "1/s", 0.02 * rate, 50.0 * rate, math.inf, 0.5 * rate, log=True, scan=10),)
+        return (
+            EffectParameter(
+                "rate", "1/s", 0.02 * rate, 50.0 * rate, math.inf, 0.5 * rate, log=True, scan=10, form=0.01
+            ),
+        )
 
     def begin(self, values: Values, command: Any, moment: Moment) -> Memory:
         """Arrived."""

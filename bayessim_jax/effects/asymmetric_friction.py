@@ -28,8 +28,8 @@ class AsymmetricFriction(ForceEffect):
         """F₊ and F₋, the levels against motion in the positive and in the negative direction."""
         force = scales.force
         return (
-            EffectParameter("positive", scales.force_unit, 0.0, force, 0.0, 0.12 * force),
-            EffectParameter("negative", scales.force_unit, 0.0, force, 0.0, 0.08 * force),
+            EffectParameter("positive", scales.force_unit, 0.0, force, 0.0, 0.12 * force, form=0.01),
+            EffectParameter("negative", scales.force_unit, 0.0, force, 0.0, 0.08 * force, form=0.01),
         )
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:

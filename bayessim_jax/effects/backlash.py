@@ -31,7 +31,7 @@ class Backlash(ForceEffect):
         """The gap g and the rotor's inertia J."""
         inertia = scales.inertia
         return (
-            EffectParameter("gap", scales.unit, 0.0, 0.5 * scales.position, 0.0, 0.03 * scales.position),
+            EffectParameter("gap", scales.unit, 0.0, 0.5 * scales.position, 0.0, 0.03 * scales.position, form=0.02),
             EffectParameter("rotor_inertia", scales.inertia_unit, 0.0, inertia, 0.0, 0.1 * inertia),
         )
 

@@ -10,9 +10,10 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from bayessim_jax.contracts import Box, Scalar, System
-from bayessim_jax.effects.augmented import AugmentedState
+from bayessim_jax.effects.commands import begin_one, pass_one
 from bayessim_jax.effects.contract import Moment
 from bayessim_jax.effects.places import Site, at
+from bayessim_jax.effects.rig import AugmentedState
 from bayessim_jax.effects.wiring import Wired
 
 __all__ = ["AugmentedSystem", "find_commands"]
@@ -69,12 +70,8 @@ class AugmentedSystem:
             if w.effect.port == "sense":
                 memories.append(w.effect.begin(w.values(theta), moment))
                 continue
-            picked = tuple(commands[i] for i in w.site.actuators)
-            picked = picked[0] if len(picked) == 1 else picked
-            memories.append(
-                jax.tree.map(lambda x: jnp.asarray(x, kind), w.effect.begin(w.values(theta), picked, moment))
-            )
-            commands, _ = self._pass(theta, w, memories[-1], commands, moment)
+            commands, memory = begin_one(w, theta, commands, moment)
+            memories.append(memory)
         return AugmentedState(base, tuple(memories), (), time)
 
     def step(self, theta: Float[Array, " d"], state: AugmentedState, action: Float[Array, " act"]) -> AugmentedState:
@@ -84,7 +81,7 @@ class AugmentedSystem:
         moment = Moment(state.time, self.dt)
         for k, w in enumerate(self.effects):
             if w.effect.port == "act":
-                commands, memories[k] = self._pass(theta, w, memories[k], commands, moment)
+                commands, memories[k] = pass_one(w, theta, memories[k], commands, moment)
         base = self.base.step(theta[: self.base.parameters.size], state.base, jnp.stack(commands))
         return AugmentedState(base, tuple(memories), (), state.time + self.dt)
 
@@ -109,17 +106,6 @@ class AugmentedSystem:
                     w.effect.sense(w.values(theta), state.memories[k], seen[c], Moment(state.time, self.dt))
                 )
         return seen
-
-    def _pass(
-        self, theta: Float[Array, " d"], wired: Wired, memory: Any, commands: list[Any], moment: Moment
-    ) -> tuple[list[Any], Any]:
-        picked = tuple(commands[i] for i in wired.site.actuators)
-        picked = picked[0] if len(picked) == 1 else picked
-        new, memory = wired.effect.command(wired.values(theta), memory, picked, moment)
-        commands = list(commands)
-        for actuator, value in zip(wired.site.actuators, new if isinstance(new, tuple) else (new,), strict=True):
-            commands[actuator] = value
-        return commands, memory
 
 
 def find_commands(system: System[Any], place: str) -> Site:

@@ -83,6 +83,12 @@ class Scales:
     """Coefficient of the contact at the place in the model."""
     unit: str = "rad"
     """Of the position."""
+    other_position: float = 1.0
+    """Of the joint that acts on this one, m or rad, where the place names one."""
+    other_speed: float = 3.0
+    """Of that joint, m/s or rad/s."""
+    other_unit: str = "rad"
+    """Of its position."""
 
     @property
     def force_unit(self) -> str:
@@ -117,6 +123,12 @@ class EffectParameter:
     """So many values, spread evenly over the range, are begun from, because the likelihood may have many maxima.
 
     Parameters of one unit go together, such as the beginning and the end of an event.
+    """
+    form: float = 0.005
+    """Relative standard deviation of the number between forms of the law in use, which recordings do not tell.
+
+    An interval is never narrower: a friction that recordings fix to a thousandth with one smooth sign is another with
+    another one.
     """
 
     def __post_init__(self) -> None:

@@ -27,7 +27,7 @@ class CoulombFriction(ForceEffect):
 
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The level F_c."""
-        return (EffectParameter("coulomb", scales.force_unit, 0.0, scales.force, 0.0, 0.1 * scales.force),)
+        return (EffectParameter("coulomb", scales.force_unit, 0.0, scales.force, 0.0, 0.1 * scales.force, form=0.01),)
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
         """Opposes motion, or holds."""

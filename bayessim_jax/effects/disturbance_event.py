@@ -30,9 +30,9 @@ class DisturbanceEvent(ForceEffect):
         """t₀, t₁ and P."""
         duration, impulse = scales.duration, 4.0 * scales.inertia * scales.speed
         return (
-            EffectParameter("start", "s", 0.0, duration, 0.45 * duration, 0.45 * duration, scan=8),
-            EffectParameter("end", "s", 0.0, duration, 0.55 * duration, 0.55 * duration, scan=8),
-            EffectParameter("impulse", f"{scales.force_unit} s", -impulse, impulse, 0.0, 0.05 * impulse),
+            EffectParameter("start", "s", 0.0, duration, 0.45 * duration, 0.45 * duration, scan=8, form=0.05),
+            EffectParameter("end", "s", 0.0, duration, 0.55 * duration, 0.55 * duration, scan=8, form=0.05),
+            EffectParameter("impulse", f"{scales.force_unit} s", -impulse, impulse, 0.0, 0.05 * impulse, form=0.01),
         )
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:

@@ -17,7 +17,7 @@ class GainDrift(ActEffect):
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The rate r."""
         rate = 1.0 / scales.duration
-        return (EffectParameter("rate", "1/s", -3.0 * rate, 3.0 * rate, 0.0, -0.1 * rate),)
+        return (EffectParameter("rate", "1/s", -3.0 * rate, 3.0 * rate, 0.0, -0.1 * rate, form=0.05),)
 
     def command(self, values: Values, memory: Memory, command: Any, moment: Moment) -> tuple[Any, Memory]:
         """The command times the gain of this time."""

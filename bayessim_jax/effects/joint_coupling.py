@@ -14,7 +14,7 @@ class JointCoupling(ForceEffect):
     """τⱼ = k x of joint i: its motor's torque, its position or its velocity, as the place says.
 
     `joint/elbow#torque/shoulder` is what the shoulder's motor exerts on the elbow. k has no unit, or is in N m/rad or
-    N m s/rad (N for N m at a slide j).
+    N m s/rad (N for N m where j slides, m for rad where i does).
     """
 
     name = "joint_coupling"
@@ -35,8 +35,8 @@ class JointCoupling(ForceEffect):
         way, force = detail(place).partition("/")[0], scales.force_unit
         high, unit = {
             "torque": (1.0, ""),
-            "position": (2.0 * scales.force / scales.position, f"{force}/{scales.unit}"),
-            "velocity": (scales.force / scales.speed, f"{force} s/{scales.unit}"),
+            "position": (2.0 * scales.force / scales.other_position, f"{force}/{scales.other_unit}"),
+            "velocity": (scales.force / scales.other_speed, f"{force} s/{scales.other_unit}"),
         }[way]
         return (EffectParameter("gain", unit, -high, high, 0.0, 0.1 * high),)
 

@@ -43,7 +43,14 @@ class JointFlexibility(ForceEffect):
         return (
             EffectParameter("stiffness", unit, 0.01 * start, high, start, start, log=True, scan=24),
             EffectParameter(
-                "damping", f"{scales.force_unit} s/{scales.unit}", 0.02 * first, damping, first, first, log=True
+                "damping",
+                f"{scales.force_unit} s/{scales.unit}",
+                0.02 * first,
+                damping,
+                first,
+                first,
+                log=True,
+                form=0.1,
             ),
             EffectParameter("rotor_inertia", scales.inertia_unit, 0.0, 2.0 * inertia, 0.0, 0.3 * inertia),
         )

@@ -31,8 +31,8 @@ class LoadDependentFriction(ForceEffect):
         """F_c and K."""
         force = scales.force
         return (
-            EffectParameter("coulomb", scales.force_unit, 0.0, force, 0.0, 0.05 * force),
-            EffectParameter("gain", "", 0.0, 1.0, 0.0, 0.1),
+            EffectParameter("coulomb", scales.force_unit, 0.0, force, 0.0, 0.05 * force, form=0.01),
+            EffectParameter("gain", "", 0.0, 1.0, 0.0, 0.1, form=0.01),
         )
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:

@@ -39,11 +39,15 @@ class LuGreFriction(ForceEffect):
         damping = 2.0 * (k * scales.inertia) ** 0.5
         unit = f"{scales.force_unit}/{scales.unit}"
         return (
-            EffectParameter("stiffness", unit, k, 1e5 * k, 100.0 * k, 100.0 * k, log=True, scan=4),
-            EffectParameter("damping", f"{scales.force_unit} s/{scales.unit}", 0.0, 10.0 * damping, 0.0, damping),
-            EffectParameter("coulomb", scales.force_unit, 0.0, force, 0.0, 0.1 * force),
-            EffectParameter("static", scales.force_unit, 0.0, 1.5 * force, 0.0, 0.2 * force),
-            EffectParameter("velocity", f"{scales.unit}/s", 1e-3 * speed, speed, 0.1 * speed, 0.1 * speed, log=True),
+            EffectParameter("stiffness", unit, k, 1e5 * k, 100.0 * k, 100.0 * k, log=True, scan=4, form=0.05),
+            EffectParameter(
+                "damping", f"{scales.force_unit} s/{scales.unit}", 0.0, 10.0 * damping, 0.0, damping, form=0.05
+            ),
+            EffectParameter("coulomb", scales.force_unit, 0.0, force, 0.0, 0.1 * force, form=0.05),
+            EffectParameter("static", scales.force_unit, 0.0, 1.5 * force, 0.0, 0.2 * force, form=0.1),
+            EffectParameter(
+                "velocity", f"{scales.unit}/s", 1e-3 * speed, speed, 0.1 * speed, 0.1 * speed, log=True, form=0.3
+            ),
         )
 
     def begin(self, values: Values, moment: Moment) -> Memory:

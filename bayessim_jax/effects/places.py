@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import mujoco
@@ -17,6 +18,7 @@ __all__ = [
     "encoders",
     "find_body",
     "find_site",
+    "has_rate",
     "joints",
     "movable_bodies",
 ]
@@ -44,6 +46,11 @@ def at(place: str) -> str:
 def detail(place: str) -> str:
     """What stands after the `#`."""
     return place.partition("#")[2]
+
+
+def has_rate(place: str, channels: Collection[str]) -> bool:
+    """Whether the velocity that belongs to a position is a channel, too."""
+    return at(place).removesuffix("/qpos") + "/qvel" in channels
 
 
 def joints(model: mujoco.MjModel) -> list[str]:

@@ -28,7 +28,11 @@ class QuadraticDrag(ForceEffect):
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The coefficient c."""
         high = 2.0 * scales.force / scales.speed**2
-        return (EffectParameter("coefficient", f"{scales.force_unit} s²/{scales.unit}²", 0.0, high, 0.0, 0.1 * high),)
+        return (
+            EffectParameter(
+                "coefficient", f"{scales.force_unit} s²/{scales.unit}²", 0.0, high, 0.0, 0.1 * high, form=0.01
+            ),
+        )
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
         """Against the motion."""

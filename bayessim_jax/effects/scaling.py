@@ -43,34 +43,35 @@ def recorded_scales(
         scales |= {"mass": float(model.body_mass[body]), "length": max(reach, size, 1e-3)}
     if joint >= 0:
         scales |= _of_joint(model, joint, qpos, qvel, ctrl)
+    other = find_site(model, place).other
+    if other >= 0:
+        scales |= {f"other_{name}": value for name, value in _of_motion(model, other, qpos, qvel).items()}
     return Scales(**scales)
 
 
+def _of_motion(model: mujoco.MjModel, joint: int, qpos: Rows, qvel: Rows) -> dict[str, Any]:
+    q, v = qpos[:, int(model.jnt_qposadr[joint])], qvel[:, int(model.jnt_dofadr[joint])]
+    slides = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
+    return {"position": _most(q - q.mean()), "speed": _most(v), "unit": "m" if slides else "rad"}
+
+
 def _of_joint(model: mujoco.MjModel, joint: int, qpos: Rows, qvel: Rows, ctrl: Rows) -> dict[str, Any]:
-    address, dof = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-    q, v = qpos[:, address], qvel[:, dof]
-    position, speed = _most(q - q.mean()), _most(v)
+    dof, motion = int(model.jnt_dofadr[joint]), _of_motion(model, joint, qpos, qvel)
     data = mujoco.MjData(model)
     loads, drives, inertias = [], [], []
-    for row in np.unique(np.linspace(0, len(q) - 1, ROWS).astype(int)):
+    for row in np.unique(np.linspace(0, len(qpos) - 1, ROWS).astype(int)):
         data.qpos[:], data.qvel[:] = qpos[row], qvel[row]
         data.ctrl[:] = ctrl[min(row, len(ctrl) - 1)] if len(ctrl) else 0.0
         mujoco.mj_forward(model, data)
         loads.append(data.qfrc_bias[dof])
         drives.append(data.qfrc_actuator[dof])
-    for row in (0, len(q) // 2, len(q) - 1):
+    for row in (0, len(qpos) // 2, len(qpos) - 1):
         inertias.append(nominal_inertia(model, qpos[row], data)[dof])
     inertia = float(np.median(inertias))
-    force = max(_most(np.array(loads)), _most(np.array(drives)), inertia * speed**2 / position)
-    slides = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
-    return {
-        "position": position,
-        "speed": speed,
-        "force": force,
-        "inertia": inertia,
-        "centre": float(q.mean()),
-        "unit": "m" if slides else "rad",
-    }
+    swing = inertia * motion["speed"] ** 2 / motion["position"]
+    force = max(_most(np.array(loads)), _most(np.array(drives)), swing)
+    centre = float(qpos[:, int(model.jnt_qposadr[joint])].mean())
+    return motion | {"force": force, "inertia": inertia, "centre": centre}
 
 
 def _nearest(model: mujoco.MjModel, place: str) -> tuple[int, int, list[int]]:

@@ -35,10 +35,18 @@ class SoftStop(ForceEffect):
         unit = f"{scales.force_unit}/{scales.unit}"
         return (
             EffectParameter(
-                "angle", scales.unit, low, high, side * reach + scales.centre, scales.centre + 0.7 * side * reach
+                "angle",
+                scales.unit,
+                low,
+                high,
+                side * reach + scales.centre,
+                scales.centre + 0.7 * side * reach,
+                form=0.01,
             ),
-            EffectParameter("stiffness", unit, 0.0, 5.0 * k, 0.0, 0.2 * k),
-            EffectParameter("damping", f"{scales.force_unit} s/{scales.unit}", 0.0, 5.0 * damping, 0.0, 0.05 * damping),
+            EffectParameter("stiffness", unit, 0.0, 5.0 * k, 0.0, 0.2 * k, form=0.03),
+            EffectParameter(
+                "damping", f"{scales.force_unit} s/{scales.unit}", 0.0, 5.0 * damping, 0.0, 0.05 * damping, form=0.5
+            ),
         )
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:

@@ -32,10 +32,18 @@ class StribeckFriction(ForceEffect):
         """F_c, F_s and v_s."""
         force, speed = scales.force, scales.speed
         return (
-            EffectParameter("coulomb", scales.force_unit, 0.0, force, 0.0, 0.1 * force),
-            EffectParameter("static", scales.force_unit, 0.0, 1.5 * force, 0.0, 0.2 * force),
+            EffectParameter("coulomb", scales.force_unit, 0.0, force, 0.0, 0.1 * force, form=0.03),
+            EffectParameter("static", scales.force_unit, 0.0, 1.5 * force, 0.0, 0.2 * force, form=0.03),
             EffectParameter(
-                "velocity", f"{scales.unit}/s", 1e-3 * speed, speed, 0.1 * speed, 0.1 * speed, log=True, scan=3
+                "velocity",
+                f"{scales.unit}/s",
+                1e-3 * speed,
+                speed,
+                0.1 * speed,
+                0.1 * speed,
+                log=True,
+                scan=3,
+                form=0.3,
             ),
         )
 

@@ -97,6 +97,21 @@ def test_the_table_is_what_is_registered():
         lookup_effect("stribek")
 
 
+@pytest.mark.parametrize("speed", [0.2, 5.0])
+def test_a_coupling_may_be_as_strong_as_its_joint_however_slowly_the_other_moves(speed):
+    model = system(*MODELS["arm"]).engine.model
+    assert model.nv == 2
+    time = np.linspace(0.0, 6.0, 400)
+    qpos = np.stack([speed * np.sin(time), np.sin(3.0 * time)], axis=1)
+    qvel = np.stack([speed * np.cos(time), 3.0 * np.cos(3.0 * time)], axis=1)
+    rows = qpos, qvel, np.zeros((len(time), model.nu))
+    for way, usual in (("velocity", speed), ("position", speed)):
+        place = f"joint/elbow#{way}/shoulder"
+        scales = recorded_scales(model, place, *rows, 0.01, 6.0)
+        gain = EFFECTS["joint_coupling"].parameters(place, scales)[0]
+        assert gain.high * usual == pytest.approx({"velocity": 1.0, "position": 2.0}[way] * scales.force, rel=0.02)
+
+
 @pytest.fixture
 def in_float64():
     """In every thread: callbacks do not see `jax.enable_x64` of the thread that called."""
