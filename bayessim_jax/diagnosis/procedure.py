@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import chain, count
 from typing import Any, TypeVar
 
@@ -25,9 +25,12 @@ from bayessim_jax.diagnosis.verdict import (
     Entry,
     Thresholds,
     are_kin,
+    contains,
     decide,
     error_left,
     explains,
+    has_special_case,
+    is_worth,
     share_left,
 )
 from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, judge_misfit
@@ -48,8 +51,10 @@ FINISHED = 14
 """Single effects that are fitted to the end along the motion."""
 GLANCED = 4
 """Partners of a leader that are fitted to the end."""
+WIDEST = 4
+"""Effects of a set."""
 SIMPLE, AGAIN = 2, 4
-"""Parameters of a candidate that is simulated from one point only, and how many others are from several."""
+"""Parameters of a candidate that is simulated from one point only, and how many others, and rivals, are from more."""
 KIN = 2
 """Relatives of the best pair's members, of which partners are looked for as well."""
 WORTH = 0.5
@@ -60,6 +65,8 @@ WORKERS = 2
 """Candidates that are tried at the same time."""
 ROUNDS = 4
 """Of a fit and its noise, at most."""
+ENOUGH = 0.5
+"""Share of the windows that have to be known to have a full past, for the others not to count against a memory."""
 FOLDS = 4
 """Groups of recordings, each scored by fits to the others."""
 
@@ -73,6 +80,8 @@ class _Work:
     group: Int[np.ndarray, " windows"]
     floor: Array
     say: Callable[[str], None]
+    remembered: Bool[np.ndarray, " windows"] | None = None
+    """Windows before which as much was recorded as effects remember, unless that is so for few."""
     numbers: tuple[int, ...] = ()
     """Of the problem's pairs, those on the bench."""
 
@@ -157,7 +166,8 @@ def name_effects(
     """Find what a simulator lacks whose misfit was detected.
 
     First every effect at every place along the recorded motion (`diagnosis.screen`); then the best of them are
-    simulated on a bench of their own, and pairs where one is not enough.
+    simulated on a bench of their own, pairs where one is not enough, and larger sets where the best pair is worth both
+    of its effects and is not enough either.
     """
     thresholds = thresholds or Thresholds()
     screen, start = problem.screen(problem.pairs), detected.fit
@@ -171,7 +181,7 @@ def name_effects(
     singles = _finalists(screen, nothing, ranked)
     work = _bench_of(key, problem, singles, say)
     none = _without(work, problem, detected)
-    entries = _finish(work, none, singles, problem.ahead)
+    entries = _finish(work, none, singles, problem.ahead, thresholds)
     left = share_left(entries[0].misfit, none.misfit) if entries else 1.0
     explained = bool(entries) and explains(entries[0], none, thresholds)
     if left > thresholds.enough or not explained or entries[0].ahead > thresholds.doubtful:
@@ -179,14 +189,85 @@ def name_effects(
         before = screen.misfit(key, nothing)
         remain = lambda found: share_left(screen.misfit(key, found), before)  # noqa: E731
         worth = thresholds.worth * remain(ranked[0]) if explained else np.inf
-        pairs = [pair for pair in _pair(key, screens, nothing, ranked, begun)[:PAIRS] if remain(pair) < worth]
+        growth = _Growth(screens, begun)
+        pairs = [pair for pair in _pair(key, growth, nothing, ranked)[:PAIRS] if remain(pair) < worth]
         if pairs:
             alone = {k for pair in pairs for k in pair.candidate.effects}
             best = {work.numbers[k] for entry in entries[:2] for k in entry.candidate.effects}
             kept = [*pairs, *(found for found in ranked if found.candidate.effects[0] in alone | best)]
             work = _bench_of(key, problem, kept, say)
-            entries = _finish(work, none, kept, problem.ahead)
+            entries = _finish(work, none, kept, problem.ahead, thresholds)
+            while entries and _is_too_narrow(entries, none, thresholds):
+                leads = [_settled(screen, work, entry, kept) for entry in _widest(work.bench, none, entries)]
+                grown = [(found, known) for known in leads for found in growth.extend(known)]
+                wider = [found for found, known in grown if remain(found) < thresholds.worth * remain(known)]
+                if not wider:
+                    break
+                say(f"{len(leads[0].candidate.effects)} effects are not enough: trying another one")
+                wider = sorted(wider, key=lambda found: -found.score)[:PAIRS]
+                kept = [*wider, *kept]
+                work = _bench_of(key, problem, kept, say)
+                entries = _finish(work, none, kept, problem.ahead, thresholds)
     return decide(work.bench, none, entries, work.group, thresholds, listed)
+
+
+def _is_too_narrow(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:
+    """Whether the best set has as many effects as any that was tried, is worth them all, and is not enough."""
+    best = entries[0]
+    size = len(best.candidate.effects)
+    if size < max(len(entry.candidate.effects) for entry in entries) or size >= WIDEST:
+        return False
+    left = share_left(best.misfit, none.misfit)
+    lacking = not explains(best, none, thresholds) or left > thresholds.enough or best.ahead > thresholds.lacking
+    return lacking and is_worth(best, entries, none, thresholds)
+
+
+def _widest(bench: Bench, none: Entry, entries: Sequence[Entry]) -> list[Entry]:
+    """The best set, and others of as many effects that leave room for more."""
+    size = len(entries[0].candidate.effects)
+    alike = [entry for entry in entries if len(entry.candidate.effects) == size]
+    return _with_room(alike, 1, lambda e: len(bench.columns(e.candidate)), lambda e: e.score - none.score)
+
+
+def _settled(screen: Screen, work: _Work, entry: Entry, kept: Sequence[Screened]) -> Screened:
+    """What was found in simulation, fitted along the motion again."""
+    candidate = Candidate(tuple(work.numbers[k] for k in entry.candidate.effects))
+    known = next(found for found in kept if found.candidate == candidate)
+    return screen.settle(candidate, entry.fit.z, known.delta, entry.fit.sigma) or known
+
+
+class _Growth:
+    """Sets of effects that grow by one effect at a time along the motion; none is tried twice."""
+
+    def __init__(self, screens: Sequence[Screen], begun: Sequence[Begun]) -> None:
+        self.screens = screens
+        self.seen: set[Candidate] = set()
+        self.alone = {each.candidate.effects[0]: screens[0].own(each) for each in begun}
+
+    def extend(self, known: Screened) -> list[Screened]:
+        """The best sets of the known effects and another one."""
+        first = self.screens[0]
+        wider = {known.candidate + Candidate((k,)): k for k in range(len(first.pairs))}
+        larger = len(known.candidate.effects) + 1
+        tried = [s for s in wider if len(s.effects) == larger and s not in self.seen and first.takes(s)]
+        self.seen.update(tried)
+        costs = _each(self.screens, tried, lambda screen, s: screen.glance(s, known, self.alone.get(wider[s])))
+        finite = [(cost, s) for cost, s in zip(costs, tried, strict=True) if np.isfinite(cost)]
+        best = [s for _, s in sorted(finite, key=lambda item: item[0])[:GLANCED]]
+        # a glance may miss what its general case shows
+        best += [s for s in tried if s not in best and any(self._is_special_case(wider[s], wider[b]) for b in best)]
+
+        def finish(screen: Screen, candidate: Candidate) -> Screened | None:
+            started = screen.begin_candidate(candidate, known)
+            return screen.finish_candidate(started, known) if started is not None else None
+
+        return [each for each in _each(self.screens, best, finish) if each is not None]
+
+    def _is_special_case(self, effect: int, other: int) -> bool:
+        """Whether an effect is a special case of another one at the same joint."""
+        scene = self.screens[0].scene
+        names = (f"{scene.pairs[k][0].name}@{scene.sites[k].joint}" for k in (other, effect))
+        return effect != other and scene.sites[effect].joint >= 0 and contains(*names)
 
 
 def _quiet(text: str) -> None:
@@ -198,7 +279,10 @@ def _bench_of(key: PRNGKeyArray, problem: Problem, candidates: Sequence[Screened
     numbers = sorted({k for found in candidates for k in found.candidate.effects})
     bench = problem.bench([problem.pairs[k] for k in numbers])
     say(f"simulating {len(candidates)} candidates; compiling takes a while")
-    return _Work(key, bench, problem.group, noise_floor(bench.shots), say, tuple(numbers))
+    memory = problem.motion.past.shape[1] * problem.system.dt
+    remembered = np.asarray(problem.motion.start) > memory - 0.5 * problem.system.dt
+    enough = remembered if remembered.mean() > ENOUGH else None
+    return _Work(key, bench, problem.group, noise_floor(bench.shots), say, enough, tuple(numbers))
 
 
 def _each(screens: Sequence[Screen], items: Sequence[T], do: Callable[[Screen, T], R]) -> list[R]:
@@ -248,40 +332,18 @@ def _finalists(screen: Screen, nothing: Screened, ranked: Sequence[Screened]) ->
     ]
 
 
-def _pair(
-    key: PRNGKeyArray,
-    screens: Sequence[Screen],
-    nothing: Screened,
-    ranked: Sequence[Screened],
-    begun: Sequence[Begun],
-) -> list[Screened]:
+def _pair(key: PRNGKeyArray, growth: _Growth, nothing: Screened, ranked: Sequence[Screened]) -> list[Screened]:
     """Pairs with every other effect, the best first: of leading single effects, of the best pair's members and kin.
 
     A special case may do best by itself, and with a partner that makes up for what it lacks, and hide its general case.
     """
+    first = growth.screens[0]
     found: list[Screened] = []
-    seen: set[Candidate] = set()
-    first = screens[0]
-    alone = {each.candidate.effects[0]: first.own(each) for each in begun}
-
-    def extend(known: Screened) -> None:
-        pairs = {known.candidate + Candidate((k,)): k for k in range(len(first.pairs))}
-        tried = [pair for pair in pairs if len(pair.effects) == 2 and pair not in seen and first.takes(pair)]
-        seen.update(tried)
-        costs = _each(screens, tried, lambda screen, pair: screen.glance(pair, known, alone.get(pairs[pair])))
-        finite = [(cost, pair) for cost, pair in zip(costs, tried, strict=True) if np.isfinite(cost)]
-        best = sorted(finite, key=lambda item: item[0])[:GLANCED]
-
-        def finish(screen: Screen, pair: Candidate) -> Screened | None:
-            started = screen.begin_candidate(pair, known)
-            return screen.finish_candidate(started, known) if started is not None else None
-
-        ended = _each(screens, [pair for _, pair in best], finish)
-        found.extend(each for each in ended if each is not None)
-
-    leaders = _leaders(first, nothing, ranked)
+    leaders = _with_room(
+        ranked, LEADERS, lambda each: first.scene.count(each.candidate), lambda each: each.score - nothing.score
+    )
     for known in leaders:
-        extend(known)
+        found += growth.extend(known)
     best = max(found, key=lambda item: item.score, default=None)
     if best is None:
         return []
@@ -289,24 +351,22 @@ def _pair(
     members = [Candidate((k,)) for k in best.candidate.effects]
     for member in members:
         if member not in led:
-            extend(first.part(best, member.effects[0]))
+            found += growth.extend(first.part(best, member.effects[0]))
     if first.misfit(key, best).p_value < FALSE_ALARMS:
         names = [first.name(member) for member in members]
         kin = [each for each in ranked if any(are_kin(first.name(each.candidate), name) for name in names)]
         for known in [each for each in kin if each.candidate not in [*led, *members]][:KIN]:
-            extend(known)
+            found += growth.extend(known)
     return sorted(found, key=lambda item: -item.score)
 
 
-def _leaders(screen: Screen, nothing: Screened, ranked: Sequence[Screened]) -> list[Screened]:
-    """The best single effects, and those that come near them with fewer parameters: these leave room for a partner."""
-    leaders = list(ranked[:LEADERS])
-    least = WORTH * (ranked[0].score - nothing.score)
-    for found in ranked[LEADERS:]:
-        fewest = min(screen.scene.count(known.candidate) for known in leaders)
-        if screen.scene.count(found.candidate) < fewest and found.score - nothing.score > least:
-            leaders.append(found)
-    return leaders
+def _with_room(items: Sequence[T], first: int, count: Callable[[T], int], gain: Callable[[T], float]) -> list[T]:
+    """The first ones, and others that come near the very first with fewer parameters: these leave room for one more."""
+    leads = list(items[:first])
+    for item in items[first:]:
+        if count(item) < min(map(count, leads)) and gain(item) > WORTH * gain(items[0]):
+            leads.append(item)
+    return leads
 
 
 def _still(problem: Problem, fit: Fit) -> Fit:
@@ -325,40 +385,84 @@ def _without(work: _Work, problem: Problem, detected: Entry) -> Entry:
     return entry
 
 
-def _finish(work: _Work, none: Entry, candidates: Sequence[Screened], ahead: Shots | None) -> list[Entry]:
+def _replace(work: _Work, entries: list[Entry], pairs: Iterable[tuple[Entry, Entry]]) -> None:
+    """Entries that were fitted again in the place of what they were, and the best first."""
+    for before, entry in pairs:
+        if entry is not before:
+            entries[entries.index(before)] = entry
+            work.say(f"{' + '.join(entry.names)}: score {entry.score:.1f}, begun elsewhere")
+    entries.sort(key=lambda entry: -entry.score)
+
+
+def _are_rivals(entry: Entry, best: Entry, none: Entry, thresholds: Thresholds) -> bool:
+    """Whether a candidate is a special case of the best one, or explains as much with one effect in another's place."""
+    replaced = len(set(best.names) - set(entry.names)) == len(set(entry.names) - set(best.names)) == 1
+    return replaced and (share_left(entry.misfit, none.misfit) <= thresholds.left or has_special_case(best, entry))
+
+
+def _with_numbers_of(bench: Bench, best: Entry, other: Entry) -> Float[Array, " k"]:
+    """Another candidate's point with the numbers of the best, as far as they have the same names."""
+    found = dict(zip(bench.columns(best.candidate), np.asarray(best.fit.z)[bench.d :].tolist(), strict=False))
+    mine = bench.columns(other.candidate)
+    replaced = {
+        bench.parameters[i].name: bench.each[i].value(jnp.asarray(z)) for i, z in found.items() if i not in mine
+    }
+    point = np.array(other.fit.z)
+    point[: bench.d] = best.fit.z[: bench.d]
+    for j, i in enumerate(mine):
+        if i in found:
+            point[bench.d + j] = found[i]
+        elif bench.parameters[i].name in replaced:
+            point[bench.d + j] = float(bench.each[i].standard(replaced[bench.parameters[i].name]))
+    return jnp.asarray(point)
+
+
+def _finish(
+    work: _Work, none: Entry, candidates: Sequence[Screened], ahead: Shots | None, thresholds: Thresholds
+) -> list[Entry]:
     """Candidates simulated and fitted from where the screen found them, and scored across recordings, best first.
 
     The best of those with many parameters that leave something are fitted from their usual values, too: where joints
-    stick and slip, what fits along the smoothed motion may be far from what fits in simulation.
+    stick and slip, what fits along the smoothed motion may be far from what fits in simulation. Rivals of the best are
+    fitted from its numbers: it must not win by a better start.
     """
     bench = work.bench
 
-    def finish(own: Candidate, points: Sequence[Float[Array, " k"]], sigma: Array, known: Entry | None) -> Entry | None:
-        entries = [known] if known else []
-        for p in points:
-            fit = bench.fit(own, p, jnp.zeros_like(none.fit.delta), jnp.maximum(sigma, work.floor))
-            if np.isfinite(float(fit.cost)):
-                entry = _enter(work, own, work.settle(own, fit))
-                entry.scores = np.logaddexp(np.log1p(-DOUBT) + entry.scores, np.log(DOUBT) + none.scores)
-                entries.append(entry)
-        return max(entries, key=lambda entry: entry.score, default=None)
+    def enter(own: Candidate, p: Float[Array, " k"], sigma: Array) -> Entry | None:
+        fit = bench.fit(own, p, jnp.zeros_like(none.fit.delta), jnp.maximum(sigma, work.floor))
+        if not np.isfinite(float(fit.cost)):
+            return None
+        entry = _enter(work, own, work.settle(own, fit))
+        entry.scores = np.logaddexp(np.log1p(-DOUBT) + entry.scores, np.log(DOUBT) + none.scores)
+        return entry
 
     def begin(found: Screened) -> Entry | None:
         own = Candidate(tuple(work.numbers.index(k) for k in found.candidate.effects))
-        return finish(own, [found.p], found.sigma, None)
+        return enter(own, found.p, found.sigma)
 
-    def again(entry: Entry) -> Entry | None:
-        return finish(entry.candidate, bench.starts(entry.candidate, jnp.zeros(bench.d)), entry.fit.sigma, entry)
+    def improve(entry: Entry, points: Sequence[Array], sigma: Array) -> Entry:
+        others = (enter(entry.candidate, p, sigma) for p in points)
+        return max([entry, *(other for other in others if other is not None)], key=lambda e: e.score)
 
+    def from_usual(entry: Entry) -> Entry:
+        return improve(entry, bench.starts(entry.candidate, jnp.zeros(bench.d)), entry.fit.sigma)
+
+    def from_numbers_of(best: Entry, entry: Entry) -> Entry:
+        return improve(entry, [_with_numbers_of(bench, best, entry)], best.fit.sigma)
+
+    entries: list[Entry] = []
     with ThreadPoolExecutor(WORKERS) as pool:
         # the first by itself: what it compiles is there for the others
-        tried = chain(map(begin, candidates[:1]), pool.map(begin, candidates[1:]))
-        entries = sorted((entry for entry in tried if entry is not None), key=lambda entry: -entry.score)
+        for entry in chain(map(begin, candidates[:1]), pool.map(begin, candidates[1:])):
+            if entry is not None:
+                entries.append(entry)
+                work.say(f"{' + '.join(entry.names)}: score {entry.score:.1f}")
+        entries.sort(key=lambda entry: -entry.score)
         left = [e for e in entries if e.misfit.p_value < FALSE_ALARMS and len(bench.columns(e.candidate)) > SIMPLE]
-        better = dict(zip(map(id, left), pool.map(again, left[:AGAIN]), strict=False))
-    entries = sorted((better.get(id(entry)) or entry for entry in entries), key=lambda entry: -entry.score)
-    for entry in entries:
-        work.say(f"{' + '.join(entry.names)}: score {entry.score:.1f}")
+        _replace(work, entries, zip(left, pool.map(from_usual, left[:AGAIN]), strict=False))
+        best = entries[0] if entries else none
+        rivals = [entry for entry in entries if _are_rivals(entry, best, none, thresholds)][:AGAIN]
+        _replace(work, entries, zip(rivals, pool.map(partial(from_numbers_of, best), rivals), strict=True))
     if ahead is not None and entries:
         _look_ahead(bench, none, entries, ahead)
     return entries
@@ -392,6 +496,9 @@ def _enter(work: _Work, candidate: Candidate, fit: Fit, known: Float[np.ndarray,
     )
     scores = np.nan_to_num(np.asarray(scores), nan=-1e12)
     misfit_key = jax.random.fold_in(work.key, sum(2**k for k in candidate.effects) % (2**31))
-    misfit = judge_misfit(misfit_key, np.asarray(fit.misses), fit.along_states, np.asarray(measured), known)
+    # what a joint's motion has left in an effect when a recording begins is not known
+    recalls = any(getattr(bench.pairs[k][0], "recalls", False) for k in candidate.effects)
+    judged = work.remembered if recalls else None
+    misfit = judge_misfit(misfit_key, np.asarray(fit.misses), fit.along_states, np.asarray(measured), known, judged)
     share = float(-0.5 * fit.z @ fit.z - 0.5 * jnp.linalg.slogdet(fit.precision)[1])
     return Entry(candidate, bench.names(candidate), fit, scores, misfit, log_share=share, seats=bench.seats(candidate))

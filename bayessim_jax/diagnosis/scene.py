@@ -26,7 +26,7 @@ from bayessim_jax.effects import Scales, at, with_effects
 from bayessim_jax.effects.contract import Numbers
 from bayessim_jax.effects.drive import CAUTION, actuators_of, drive_of, read_numbers
 from bayessim_jax.effects.history import split_history
-from bayessim_jax.effects.places import find_site
+from bayessim_jax.effects.places import find_site, has_rate
 from bayessim_jax.effects.wiring import edit_model
 from bayessim_jax.inference.shooting import Curvature, Shots
 from bayessim_jax.systems.mjcf import MjcfSystem, displace
@@ -242,7 +242,7 @@ class Scene:
             channels = [c.name for c in self.system.channels]
             rows = motion.start[:, None] + self.system.dt * jnp.arange(motion.qpos.shape[1])
             seen = (motion.qpos[..., q], motion.qvel[..., v], *(rate[..., v] for rate in self._rates))
-            prompt = name.removesuffix("/qpos") + "/qvel" in channels
+            prompt = has_rate(name, channels)
             new_q, new_v, along, along_v, slope = restore_readings(
                 effect, self.kinds[k], self.system.dt, prompt, p[place], *self.ranges[k], rows, *seen
             )

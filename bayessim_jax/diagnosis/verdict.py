@@ -12,7 +12,20 @@ from bayessim_jax.diagnosis.bench import Bench, Candidate
 from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, Misfit
 from bayessim_jax.inference.shooting import Fit, Shots
 
-__all__ = ["CONTAINS", "Diagnosis", "Entry", "Thresholds", "are_kin", "decide", "error_left", "explains", "share_left"]
+__all__ = [
+    "CONTAINS",
+    "Diagnosis",
+    "Entry",
+    "Thresholds",
+    "are_kin",
+    "contains",
+    "decide",
+    "error_left",
+    "explains",
+    "has_special_case",
+    "is_worth",
+    "share_left",
+]
 
 CONTAINS = {
     "stribeck_friction": ("coulomb_friction",),
@@ -48,9 +61,11 @@ class Thresholds:
     foreseen: float = 0.003
     """Share of the baseline's error of predictions ahead, below which what pieces leave is the sensors' own."""
     enough: float = 0.015
-    """Share that a single effect may leave before pairs are tried."""
+    """Share that effects may leave before larger sets are tried."""
     doubtful: float = 0.1
     """Share of the error of predictions ahead, above which they are tried, too."""
+    lacking: float = 0.05
+    """Share of it, above which two effects or more are tried with another one."""
     worth: float = 0.4
     """Share of what fewer effects leave, below which more effects are worth it."""
     tie: float = 2.0
@@ -112,9 +127,9 @@ class Diagnosis:
 
 
 def share_left(after: Misfit, before: Misfit) -> float:
-    """Share of a misfit that a candidate leaves, both in units of the smaller noise."""
-    noise = np.minimum(after.noise, before.noise)
-    own, was = ((m.excess * (m.noise / noise) ** 2).sum() for m in (after, before))
+    """Share of a misfit that a candidate leaves in the windows judged, both in units of the smaller noise."""
+    noise, judged = np.minimum(after.noise, before.noise), after.judged & before.judged
+    own, was = ((m.excess * (m.noise / noise) ** 2)[judged].sum() for m in (after, before))
     return float(max(own, 0.0) / max(was, 1e-12))
 
 
@@ -145,7 +160,7 @@ def error_left(
 
 def are_kin(one: str, other: str) -> bool:
     """Whether of two names at one place, `stribeck_friction@joint/hinge`, one has the other as a special case."""
-    return _contains(one, other) or _contains(other, one)
+    return contains(one, other) or contains(other, one)
 
 
 def decide(
@@ -168,14 +183,12 @@ def decide(
     tied = [entry for entry in entries if _ties(entry, entries[0], none, thresholds)]
     # what more effects explain has to be worth them: another law of the same effect leaves a rest, too
     tied += [entry for entry in entries if entry not in tied and _suffices(entry, tied, none, thresholds)]
-    tied = [
-        entry for entry in tied if explains(entry, none, thresholds) and _is_worth(entry, entries, none, thresholds)
-    ]
+    tied = [entry for entry in tied if explains(entry, none, thresholds) and is_worth(entry, entries, none, thresholds)]
     if not tied:
         return result
     fewest = min(len(entry.candidate.effects) for entry in tied)
     least = [entry for entry in tied if len(entry.candidate.effects) == fewest]
-    sets = [entry for entry in least if not any(_has_special_case(entry, other) for other in least)]
+    sets = [entry for entry in least if not any(has_special_case(entry, other) for other in least)]
     least_share = max(entry.log_share for entry in sets) - thresholds.coincidence
     sets = [entry for entry in sets if entry.log_share >= least_share]
     result.confusion = sorted(sets, key=lambda e: (len(bench.columns(e.candidate)), -e.score))
@@ -206,7 +219,7 @@ def _suffices(entry: Entry, tied: Sequence[Entry], none: Entry, thresholds: Thre
     )
 
 
-def _is_worth(entry: Entry, entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:
+def is_worth(entry: Entry, entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:
     """Whether what a set adds to a part of it leaves much less: a little less is what any further effect leaves."""
     parts = [other for other in entries if set(other.names) < set(entry.names)]
     left = share_left(entry.misfit, none.misfit)
@@ -229,18 +242,18 @@ def _resolution(best: Entry, none: Entry, thresholds: Thresholds) -> float:
     return max(thresholds.least, blur)
 
 
-def _contains(one: str, other: str) -> bool:
+def contains(one: str, other: str) -> bool:
     """Whether the first effect has the second, at the same place, as a special case."""
     (effect, _, place), (simpler, _, where) = one.partition("@"), other.partition("@")
     return place == where and simpler in CONTAINS.get(effect, ())
 
 
-def _has_special_case(entry: Entry, other: Entry) -> bool:
+def has_special_case(entry: Entry, other: Entry) -> bool:
     """Whether another candidate is this one with one effect replaced by a special case of it."""
     mine, theirs = (
         {e.seats.get(name, name) for name in set(e.names) - set(o.names)} for e, o in ((entry, other), (other, entry))
     )
-    return len(mine) == len(theirs) == 1 and _contains(mine.pop(), theirs.pop())
+    return len(mine) == len(theirs) == 1 and contains(mine.pop(), theirs.pop())
 
 
 def _weigh(result: Diagnosis, group: Int[np.ndarray, " windows"], temper: float) -> list[float]:
@@ -272,4 +285,4 @@ def _weigh(result: Diagnosis, group: Int[np.ndarray, " windows"], temper: float)
 
 def _stands_for(chosen: Entry, other: Entry) -> bool:
     """Whether a set is a part of another, or the other with an effect replaced by its special case."""
-    return set(chosen.names) < set(other.names) or _has_special_case(other, chosen)
+    return set(chosen.names) < set(other.names) or has_special_case(other, chosen)

@@ -34,6 +34,8 @@ class Misfit:
     """Slow power of each window and channel above what noise leaves there, in units of σ²: 0 on average if clean."""
     noise: Float[np.ndarray, " obs"]
     """White noise of each channel."""
+    judged: Bool[np.ndarray, " windows"]
+    """Windows that count; in others there is no excess."""
 
     def size(self, measured: Bool[np.ndarray, "windows rows obs"]) -> float:
         """Power of the misfit over that of the noise, over all that was measured."""
@@ -90,12 +92,15 @@ def judge_misfit(
     slopes: Float[Array, "windows n k"],
     measured: Bool[np.ndarray, "windows rows obs"],
     known: Float[np.ndarray, "windows rows obs"] | float = 0.0,
+    judged: Bool[np.ndarray, " windows"] | None = None,
 ) -> Misfit:
     """Test the residuals of a fit against those of white noise; `slopes` are those of predictions along δ.
 
     `known` is an error that predictions have for another reason, such as the time step. In a window it explains at most
-    what is seen there: where the simulation is chaotic it is large, and is no excuse for what other windows show.
+    what is seen there: where the simulation is chaotic it is large, and is no excuse for what other windows show. Only
+    the windows `judged` count, all of them unless told.
     """
+    counts = np.ones(len(residual), bool) if judged is None else judged
     noise = np.maximum(difference_noise(residual, measured), 1e-300)
     rows, obs = measured.shape[1:]
     slopes = (slopes.reshape(*slopes.shape[:2], rows, obs) / noise).reshape(slopes.shape)
@@ -107,5 +112,6 @@ def judge_misfit(
     share = np.minimum(power.sum(1) / np.maximum(excused, 1e-30), 1.0)
     keys = jax.random.split(key, BOOTSTRAPS)
     null = np.asarray(_null(keys, q, there, cosines, error * jnp.asarray(np.sqrt(share))[:, None, None]))
+    power, null = power * counts[:, None], null * counts[:, None]
     p_value = (1 + (null.sum((1, 2)) >= power.sum()).sum()) / (1 + BOOTSTRAPS)
-    return Misfit(float(p_value), power - null.mean(0), noise)
+    return Misfit(float(p_value), power - null.mean(0), noise, counts)

@@ -37,7 +37,7 @@ from bayessim_jax.inference.fit import Schedule
 from bayessim_jax.inference.heads import MixtureHead
 from bayessim_jax.inference.proposals import TruncatedPrior
 from bayessim_jax.inference.recalibration import CalibrationInfo
-from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Fit, Predict, Shots, expand
+from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Fit, Predict, Shots, absorb, expand
 
 __all__ = ["sample_amortised"]
 
@@ -199,10 +199,8 @@ def _look(predict: Predict, shots: Shots, commands: Array, sigma: Array, z: Arra
     windows, d, n = shots.y.shape[0], z.size, shots.spread.size
     delta = jnp.zeros((windows, n))
     r, slopes = expand(predict, shots, z, delta, sigma, step)
-    along, own = slopes[:, :d], slopes[:, d:]
-    inner = jnp.einsum("wik,wjk->wij", own, own) + jnp.eye(n)
-    absorbed = jnp.linalg.solve(inner, jnp.einsum("wik,wjk->wij", own, along))
-    score = along - jnp.einsum("wnd,wnk->wdk", absorbed, own)
+    along, (toward, own, _) = slopes[:, :d], absorb(slopes, d)
+    score = along - jnp.einsum("wnd,wnk->wdk", toward, own)
     curvature = jnp.einsum("wik,wjk->ij", score, along) + jnp.eye(d)
     reference = shots.y - r.reshape(shots.y.shape) * sigma
     return View(

@@ -29,6 +29,7 @@ from bayessim_jax.contracts import Scalar
 
 __all__ = [
     "COMPILER_OPTIONS",
+    "absorb",
     "Curvature",
     "Fit",
     "Predict",
@@ -310,11 +311,16 @@ class Ridge:
 @jax.jit
 def ridge(fit: Fit) -> Ridge:
     """What follows of a fit's own linearization."""
-    d, n = fit.z.size, fit.delta.shape[-1]
-    own = fit.slopes[:, d:]
-    inverse = jnp.linalg.inv(jnp.einsum("wik,wjk->wij", own, own) + jnp.eye(n))
-    toward = inverse @ jnp.einsum("wik,wjk->wij", own, fit.slopes[:, :d])
-    return Ridge(fit, toward, own, inverse)
+    return Ridge(fit, *absorb(fit.slopes, fit.z.size))
+
+
+def absorb(
+    slopes: Float[Array, "windows dn k"], d: int
+) -> tuple[Float[Array, "windows n d"], Float[Array, "windows n k"], Float[Array, "windows n n"]]:
+    """How initial states follow z, derivatives along these states, and the inverse of their own curvature."""
+    own = slopes[:, d:]
+    inverse = jnp.linalg.inv(jnp.einsum("wik,wjk->wij", own, own) + jnp.eye(own.shape[1]))
+    return inverse @ jnp.einsum("wik,wjk->wij", own, slopes[:, :d]), own, inverse
 
 
 def profile(predict: Predict, shots: Shots, ridge: Ridge, z: Float[Array, " d"]) -> Scalar:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from bayessim_jax.diagnosis.belief import moments_of_effects, moments_of_theta
 from bayessim_jax.diagnosis.bench import Bench, Candidate
 from bayessim_jax.diagnosis.experiment import Experiment
 from bayessim_jax.diagnosis.flexible import FEATURES, FlexibleForce, features
@@ -23,7 +24,7 @@ from bayessim_jax.diagnosis.screen import Screened
 from bayessim_jax.diagnosis.verdict import Diagnosis, Entry, Thresholds, share_left
 from bayessim_jax.effects import EFFECTS, Scales, effect_places, recorded_scales
 from bayessim_jax.inference.scores import Score, compare, error_spread, score
-from bayessim_jax.inference.shooting import Shots, robust_covariance
+from bayessim_jax.inference.shooting import Shots
 from bayessim_jax.recordings.experiments import advise, next_experiment
 from bayessim_jax.recordings.identification import channel_scale, start_spread
 from bayessim_jax.recordings.shots import CaseModel, split_windows, take
@@ -127,7 +128,7 @@ class CaseDiagnosis:
         }
 
     def _effects(self, entry: Entry) -> list[dict[str, Any]]:
-        means, sds = moments(self.bench, entry)
+        means, sds = moments_of_effects(self.bench, entry)
         found = []
         for k in entry.candidate.effects:
             effect, _, place = self.bench.name(k).partition("@")
@@ -145,26 +146,6 @@ class CaseDiagnosis:
                 }
             )
         return found
-
-
-def moments(bench: Bench, entry: Entry) -> tuple[dict[str, float], dict[str, float]]:
-    """Means and standard deviations of a candidate's effects."""
-    means = bench.values(entry.candidate, entry.fit.z)
-    covariance = np.asarray(robust_covariance(entry.fit))
-    sds = {}
-    for j, (key, column) in enumerate(zip(means, bench.columns(entry.candidate), strict=True)):
-        x = entry.fit.z[bench.d + j]
-        slope = float(jax.grad(bench.each[column].value)(x))
-        sds[key] = abs(slope) * float(np.sqrt(covariance[bench.d + j, bench.d + j]))
-    return means, sds
-
-
-def _theta(bench: Bench, entry: Entry) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation of the system's own parameters."""
-    d = bench.d
-    covariance = np.asarray(robust_covariance(entry.fit))[:d, :d]
-    slopes = np.asarray(jax.jacfwd(bench.margins.theta)(entry.fit.z[:d]))
-    return np.asarray(bench.margins.theta(entry.fit.z[:d])), np.sqrt(np.diag(slopes @ covariance @ slopes.T))
 
 
 def _thin(windows: Windows, most: int) -> Windows:
@@ -302,7 +283,10 @@ def diagnose_case(
         predictions=predictions,
         scale=scale,
         noise_floor=_floor(bench, result.best, scale, model, shots),
-        theta={which: _theta(bench, entry) for which, entry in entries.items()},
+        theta={
+            "baseline": moments_of_theta(bench, [result.baseline], [1.0]),
+            "augmented": moments_of_theta(bench, result.confusion or [result.best], result.probabilities or [1.0]),
+        },
         experiment=next_experiment(model, bench, result, shots),
     )
 

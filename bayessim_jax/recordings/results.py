@@ -12,8 +12,8 @@ import xarray as xr
 from jaxtyping import Float
 
 from bayessim_jax import __version__
+from bayessim_jax.diagnosis.belief import covariance_of
 from bayessim_jax.effects import write_mjcf
-from bayessim_jax.inference.shooting import robust_covariance
 from bayessim_jax.recordings.evaluation import write_state
 from bayessim_jax.recordings.experiments import write_experiment
 from bayessim_jax.recordings.files import replace_file, to_json, write_text
@@ -102,8 +102,7 @@ def _write_laplace(path: Path, diagnosis: CaseDiagnosis, seed: int) -> None:
     rng = np.random.default_rng(seed)
     columns = bench.columns(entry.candidate)
     size = bench.d + len(columns)
-    covariance = np.asarray(robust_covariance(entry.fit))[:size, :size]
-    z = rng.multivariate_normal(np.asarray(entry.fit.z)[:size], covariance, PRIOR_DRAWS)
+    z = rng.multivariate_normal(np.asarray(entry.fit.z)[:size], covariance_of(bench, entry), PRIOR_DRAWS)
     names = [*margins.names, *(variable(name) for name in bench.values(entry.candidate, entry.fit.z))]
     units = [*margins.units, *(bench.parameters[i].unit for i in columns)]
     each = [*margins.each, *(bench.each[i] for i in columns)]

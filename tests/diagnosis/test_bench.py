@@ -1,6 +1,7 @@
 """One simulator that holds every effect: neutral, it is the simulator without them."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from bayessim_jax.diagnosis.bench import Candidate
-from bayessim_jax.diagnosis.procedure import Problem, _folds, detect
+from bayessim_jax.diagnosis.procedure import Problem, _folds, _with_numbers_of, detect
 from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.effects import EFFECTS, Scales
 from bayessim_jax.inference.direct import estimate_noise
@@ -71,7 +72,8 @@ def test_the_screen_knows_what_a_sensors_error_changes_in_the_first_state_too(pr
         moved[scene.d] = x
         return scene.assess(free, moved, still, sigma)
 
-    slope = np.asarray(residuals(0.0)[2])[:, scene.d].reshape(np.shape(residuals(0.0)[1]))
+    _, here, slopes = residuals(0.0)
+    slope = np.asarray(slopes)[:, scene.d].reshape(here.shape)
     beside = (np.asarray(residuals(1e-4)[1]) - np.asarray(residuals(-1e-4)[1])) / 2e-4
     np.testing.assert_allclose(-slope, beside, atol=0.1 * np.abs(beside).max())
 
@@ -176,3 +178,22 @@ def test_scores_are_those_of_fits_without_the_fold(problem):
         logs = -0.5 * judged.r**2 - jnp.log(sigma)
         exact += np.where(out, np.where(left.measured, logs, 0.0).sum((1, 2)), 0.0)
     np.testing.assert_allclose(entry.scores, exact, rtol=0.02)
+
+
+def test_a_special_case_begins_with_the_numbers_of_what_contains_it(problem):
+    """So that both predict the same there: a Stribeck curve whose levels are equal is a dry friction."""
+    bench = problem.bench(problem.pairs)
+    general, special = Candidate((1, 4)), Candidate((0, 4))
+    coulomb, static, velocity = bench.columns(Candidate((1,)))
+    level = 0.3 * bench.parameters[coulomb].high
+    z = np.zeros(bench.size)
+    z[: bench.d] = 0.4
+    for j, (column, value) in enumerate(((coulomb, level), (static, level), (velocity, 0.1))):
+        z[bench.d + j] = bench.each[column].standard(jnp.asarray(value))
+    z[bench.d + 3] = -0.7  # the armature, which both have
+    known = SimpleNamespace(candidate=general, fit=SimpleNamespace(z=jnp.asarray(z)))
+    other = SimpleNamespace(candidate=special, fit=SimpleNamespace(z=jnp.zeros(bench.size)))
+    begun = _with_numbers_of(bench, known, other)
+    assert bench.values(special, begun)["coulomb_friction@joint/hinge/coulomb"] == pytest.approx(level)
+    same = [bench.replay(candidate, x, bench.shots) for candidate, x in ((general, z), (special, begun))]
+    np.testing.assert_allclose(*same, atol=1e-12)

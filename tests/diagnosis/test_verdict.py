@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from bayessim_jax.diagnosis.bench import Candidate
+from bayessim_jax.diagnosis.procedure import _is_too_narrow
 from bayessim_jax.diagnosis.verdict import Entry, Thresholds, are_kin, decide, error_left
 from bayessim_jax.diagnosis.whiteness import Misfit
 from bayessim_jax.inference.shooting import Shots
@@ -16,7 +17,7 @@ class OneParameterEach:
 
 def entry(names, mean, left, p=0.001, spread=1.0, seed=0):
     scores = mean + spread * np.random.default_rng(seed).normal(size=WINDOWS)
-    misfit = Misfit(p, np.full((WINDOWS, 1), left), np.ones(1))
+    misfit = Misfit(p, np.full((WINDOWS, 1), left), np.ones(1), np.ones(WINDOWS, bool))
     return Entry(Candidate(tuple(range(len(names)))), names, None, scores, misfit)
 
 
@@ -133,3 +134,16 @@ def test_a_set_that_wins_in_few_recordings_is_less_probable():
     found = verdict(first, second)
     assert found.verdict == "ambiguous"
     assert 0.8 < found.probabilities[0] < 0.95
+
+
+def test_a_set_is_widened_only_where_it_is_worth_its_effects_and_is_not_enough():
+    none = entry([], 0.0, 1.0)
+    alone, other = entry(["a@x"], 100.0, 0.5), entry(["b@x"], 90.0, 0.6, seed=1)
+    cases = ((0.1, 0.2, True), (0.01, 0.2, True), (0.02, 0.02, True), (0.01, 0.01, False), (0.4, 0.2, False))
+    for left, ahead, wanted in cases:
+        pair = entry(["a@x", "b@x"], 200.0, left, seed=2)
+        pair.ahead = ahead
+        assert _is_too_narrow([pair, alone, other], none, Thresholds()) is wanted
+    assert not _is_too_narrow([alone, pair], none, Thresholds())
+    most = entry(["a@x", "b@x", "c@x", "d@x"], 300.0, 0.2, seed=3)
+    assert not _is_too_narrow([most, alone], none, Thresholds())

@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 
+from bayessim_jax.diagnosis.verdict import share_left
 from bayessim_jax.diagnosis.whiteness import judge_misfit
 
 
@@ -35,3 +36,21 @@ def test_residuals_of_a_constant_size_are_no_noise():
     noise = 0.1 * rng.standard_normal((windows, rows, 1))
     p_values = [judge_misfit(jax.random.key(0), noise + off, slopes, measured).p_value for off in (0.0, 0.1)]
     assert p_values[0] > 0.05 > 0.01 > p_values[1]
+
+
+def test_windows_that_do_not_count_are_no_evidence_before_or_after():
+    """An effect that remembers is off where its past is unknown: these windows are left out on both sides."""
+    rng, (windows, rows) = np.random.default_rng(2), (20, 40)
+    slopes = jax.numpy.asarray(np.linspace(-1, 1, rows)[None, None].repeat(windows, 0))
+    measured = np.ones((windows, rows, 1), bool)
+    noise = 0.1 * rng.standard_normal((windows, rows, 1))
+    wave = np.sin(np.linspace(0, 5, rows))[:, None]
+    first = np.arange(windows)[:, None, None] < 5
+    before = judge_misfit(jax.random.key(0), noise + wave, slopes, measured)
+    after = noise + np.where(first, wave, 0.02 * wave)
+    every = judge_misfit(jax.random.key(0), after, slopes, measured)
+    later = judge_misfit(jax.random.key(0), after, slopes, measured, judged=~first[:, 0, 0])
+    assert share_left(every, before) == pytest.approx(0.25, abs=0.03)
+    assert share_left(later, before) < 0.005
+    assert every.p_value < 0.01 < later.p_value
+    assert (later.excess[:5] == 0).all()

@@ -211,7 +211,8 @@ def test_the_scoreboard_counts_predictions_and_intervals():
         ],
         "parameters": {"mass": 0.5},
     }
-    found = {"effect": "coulomb_friction", "at": "joint/a", "parameters": {"coulomb": {"mean": 0.11, "sd": 0.01}}}
+    moment = {"mean": 0.11, "sd": 0.01, "unit": "N m"}
+    found = {"effect": "coulomb_friction", "at": "joint/a", "parameters": {"coulomb": moment}}
     moments = {"baseline": {"mean": 0.6, "sd": 0.01}, "augmented": {"mean": 0.505, "sd": 0.01}}
     row = {
         "case": {"group": "single"},
@@ -235,3 +236,23 @@ def test_the_scoreboard_counts_predictions_and_intervals():
     assert "refused 1, single best 0, joint right 1 of 1, library without abstention: wrong in 1" in summarize(
         [refused | judge(sealed, refused)]
     )
+
+
+def test_the_scoreboard_compares_angles_on_the_circle():
+    ripple = {"effect": "cogging", "at": "joint/a", "joint": "joint/a", "parameters": {"phase": -3.13}}
+    moment = {"mean": 3.14, "sd": 0.02, "unit": "rad"}
+    sealed = {"effects": [ripple], "parameters": {"mass": 0.5}}
+    row = {
+        "case": {"group": "single"},
+        "sealed": sealed,
+        "seconds": 3.0,
+        "verdict": "explained",
+        "effects": [{"effect": "cogging", "at": "joint/a", "parameters": {"phase": moment}}],
+        "confusion_set": [],
+        "closest": ["cogging@joint/a"],
+        "locations": [{"at": "joint/a"}],
+        "parameters": {"mass": {"baseline": {"mean": 0.5, "sd": 0.1}, "augmented": {"mean": 0.5, "sd": 0.1}}},
+        "nrmse": {"baseline": 0.5, "augmented": 0.14, "flexible": 0.2},
+        "noise_floor": 0.1,
+    }
+    assert "those of effects hold the world's in 100% of 1" in summarize([row | judge(sealed, row)])

@@ -59,14 +59,20 @@ def test_one_recording_is_split_by_windows(tmp_path):
     assert set(np.round(fitted.start, 6)) & set(np.round(held.start, 6)) == set()
 
 
-def test_a_parameter_that_nothing_depends_on_is_named(tmp_path):
+@pytest.fixture
+def with_lift(tmp_path):
+    """A slide with a parameter that nothing depends on."""
     folder = tmp_path / "rig"
     make_case(folder, "slide", seed=6)
     text = (folder / "case.toml").read_text()
     text += '\n[[parameters]]\nname = "lift"\ntargets = ["body/carriage/ipos/2"]\n'
     text += 'prior = { distribution = "uniform", low = -0.1, high = 0.1 }\n'
     (folder / "case.toml").write_text(text)
-    found = inferred(folder).identifiability
+    return folder
+
+
+def test_a_parameter_that_nothing_depends_on_is_named(with_lift):
+    found = inferred(with_lift).identifiability
     assert found.not_informed == ["lift"]
 
 
@@ -132,13 +138,7 @@ def test_credible_sets_of_many_worlds_hold_the_truth_as_often_as_they_say(tmp_pa
 
 
 @pytest.mark.slow
-def test_networks_name_what_the_recordings_do_not_inform(tmp_path):
-    folder = tmp_path / "rig"
-    make_case(folder, "slide", seed=6)
-    text = (folder / "case.toml").read_text()
-    text += '\n[[parameters]]\nname = "lift"\ntargets = ["body/carriage/ipos/2"]\n'
-    text += 'prior = { distribution = "uniform", low = -0.1, high = 0.1 }\n'
-    (folder / "case.toml").write_text(text)
-    found = inferred(folder, method="amortised")
+def test_networks_name_what_the_recordings_do_not_inform(with_lift):
+    found = inferred(with_lift, method="amortised")
     assert found.identifiability.not_informed == ["lift"]
     assert found.posterior.z[:, 1].std() == pytest.approx(1.0, abs=0.2)

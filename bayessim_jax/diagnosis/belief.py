@@ -1,0 +1,66 @@
+"""What is believed of a candidate's numbers: Laplace's covariance, wider by what is not known of the laws' form."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from bayessim_jax.diagnosis.bench import Bench
+from bayessim_jax.diagnosis.verdict import Entry
+from bayessim_jax.inference.shooting import robust_covariance
+
+__all__ = ["covariance_of", "moments_of_effects", "moments_of_theta"]
+
+
+def covariance_of(bench: Bench, entry: Entry) -> Float[np.ndarray, "k k"]:
+    """Covariance of z, θ's and the effects', in the coordinates of a fit.
+
+    That of the fit, wide where windows disagree (`robust_covariance`), and for the number y = value(z) of an effect a
+    variance (f y)² more, f its `EffectParameter.form`: recordings that fix a number to a thousandth fix it within one
+    form of its law.
+    """
+    size = bench.d + len(bench.columns(entry.candidate))
+    covariance = np.asarray(robust_covariance(entry.fit))[:size, :size].copy()
+    values = np.array(list(bench.values(entry.candidate, entry.fit.z).values()))
+    form = np.array([bench.parameters[i].form for i in bench.columns(entry.candidate)])
+    # no wider than the prior, whose standard deviation is 1
+    own = np.minimum(form * np.abs(values) / np.maximum(_slopes(bench, entry), 1e-12), 1.0)
+    covariance[range(bench.d, size), range(bench.d, size)] += own**2
+    return covariance
+
+
+def moments_of_effects(bench: Bench, entry: Entry) -> tuple[dict[str, float], dict[str, float]]:
+    """Means and standard deviations of the numbers of a candidate's effects, by name."""
+    means = bench.values(entry.candidate, entry.fit.z)
+    wide = np.sqrt(np.diag(covariance_of(bench, entry))[bench.d :])
+    return means, dict(zip(means, (_slopes(bench, entry) * wide).tolist(), strict=True))
+
+
+def moments_of_theta(
+    bench: Bench, entries: Sequence[Entry], weights: Sequence[float]
+) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+    """Mean of the system's own parameters under the first candidate, and how far the truth may be from it.
+
+    Where others tie with the first, that is √Σ w (σ² + (μ − μ₁)²) over all of them, by their probabilities w: each has
+    parameters of its own, and they cannot all be right.
+    """
+    d = bench.d
+    share = np.asarray(weights) / np.sum(weights)
+    means, variances = [], []
+    for entry in entries:
+        slopes = np.asarray(jax.jacfwd(bench.margins.theta)(entry.fit.z[:d]))
+        means.append(np.asarray(bench.margins.theta(entry.fit.z[:d])))
+        variances.append(np.diag(slopes @ covariance_of(bench, entry)[:d, :d] @ slopes.T))
+    apart = (np.array(means) - means[0]) ** 2
+    return means[0], np.sqrt(share @ (np.array(variances) + apart))
+
+
+def _slopes(bench: Bench, entry: Entry) -> Float[np.ndarray, " e"]:
+    """How fast the effects' numbers change with their z."""
+    columns = bench.columns(entry.candidate)
+    return np.array(
+        [abs(float(jax.grad(bench.each[i].value)(entry.fit.z[bench.d + j]))) for j, i in enumerate(columns)]
+    )
