@@ -341,7 +341,9 @@ def _coverage(rows: list[dict[str, Any]]) -> list[str]:
             own = worlds[_bare(f"{effect['effect']}@{effect['at']}")]
             for name, found in effect["parameters"].items():
                 if name in own:
-                    inside["effects"].append(abs(found["mean"] - own[name]) <= INSIDE * found["sd"])
+                    off = found["mean"] - own[name]
+                    off = np.angle(np.exp(1j * off)) if found["unit"] == "rad" else off
+                    inside["effects"].append(abs(off) <= INSIDE * found["sd"])
     if not inside["augmented"]:
         return []
     return [
