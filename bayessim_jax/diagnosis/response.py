@@ -23,7 +23,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from bayessim_jax.contracts import Scalar
-from bayessim_jax.inference.shooting import Curvature, eliminate, normal_equations
+from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Curvature, eliminate, normal_equations
 from bayessim_jax.systems.mjcf import displace
 
 __all__ = [
@@ -113,7 +113,7 @@ def _rotation(origin: Float[Array, "4"], to: Float[Array, "4"]) -> Float[Array, 
     return 2.0 * jnp.sign(ow * w + ov @ v) * turn
 
 
-@partial(jax.jit, static_argnames=("engine", "numbers", "substeps", "step"))
+@partial(jax.jit, static_argnames=("engine", "numbers", "substeps", "step"), compiler_options=COMPILER_OPTIONS)
 def linearize_steps(
     engine: Any,
     numbers: Any,
@@ -167,7 +167,7 @@ def _propagate(a: Array, first: Float[Array, "n k"], added: Float[Array, "steps 
     return jnp.concatenate([first[None], jax.lax.scan(once, first, (a, added))[1]])
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
 def assess(
     lin: Linearized,
     windowed: Windowed,
@@ -206,7 +206,7 @@ def assess(
     return normal_equations(r.reshape(len(delta), -1), slopes, p, delta / windowed.spread), r, slopes
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
 def propose(
     curvature: Curvature,
     damping: Scalar,
@@ -224,7 +224,7 @@ def propose(
     return p + move, delta + (shift - toward @ move) * spread
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
 def cross_validate(
     r: Float[Array, "windows rows obs"],
     slopes: Float[Array, "windows kn rowsobs"],

@@ -28,7 +28,7 @@ from bayessim_jax.effects.drive import CAUTION, actuators_of, drive_of, read_num
 from bayessim_jax.effects.history import split_history
 from bayessim_jax.effects.places import find_site, has_rate
 from bayessim_jax.effects.wiring import edit_model
-from bayessim_jax.inference.shooting import Curvature, Shots
+from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Curvature, Shots
 from bayessim_jax.systems.mjcf import MjcfSystem, displace
 
 __all__ = ["Scene"]
@@ -341,7 +341,7 @@ class Scene:
         return around.kept[key]
 
 
-@partial(jax.jit, static_argnames=("place", "actuators", "fine"))
+@partial(jax.jit, static_argnames=("place", "actuators", "fine"), compiler_options=COMPILER_OPTIONS)
 def _look_at(
     system: MjcfSystem,
     margins: Margins,
@@ -371,7 +371,7 @@ def _look_at(
     return Joint(position, velocity, acceleration, inertia, drive)
 
 
-@partial(jax.jit, static_argnames=("nv", "size"))
+@partial(jax.jit, static_argnames=("nv", "size"), compiler_options=COMPILER_OPTIONS)
 def _assemble(
     seen: Float[Array, "windows rows obs"],
     pushes: Sequence[tuple[Any, ...]],
@@ -418,7 +418,7 @@ def _see_one(system: MjcfSystem, theta: Array, qpos: Array, qvel: Array, ctrl: A
     return see(zero), jax.vmap(lambda d: jax.jvp(see, (zero,), (d,))[1], out_axes=-1)(jnp.eye(2 * nv))
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
 def _see_all(
     system: MjcfSystem, margins: Margins, z: Array, qpos: Array, qvel: Array, ctrl: Array
 ) -> tuple[Array, Array]:

@@ -10,12 +10,15 @@ Source: von Neumann 1941 (noise from differences); Davison and Hinkley 1997 (par
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from bayessim_jax.inference.shooting import COMPILER_OPTIONS
 
 __all__ = ["Misfit", "difference_noise", "judge_misfit"]
 
@@ -70,12 +73,12 @@ def _absorb(r: Array, q: Array) -> Array:
     return (flat - jnp.einsum("wkc,wc->wk", q, jnp.einsum("wkc,wk->wc", q, flat))).reshape(r.shape)
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
 def _slow_left(r: Array, q: Array, cosines: Array) -> Float[Array, "windows obs"]:
     return _slow(_absorb(r, q), cosines)
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
 def _null(keys: Any, q: Array, measured: Array, cosines: Array, known: Array) -> Float[Array, "draws windows obs"]:
     """Slow power of what a fit leaves of white noise."""
 

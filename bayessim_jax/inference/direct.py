@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -19,7 +20,17 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from bayessim_jax.beliefs.margins import Margins
 from bayessim_jax.inference.draws import PosteriorDraws
-from bayessim_jax.inference.shooting import Fit, Predict, Ridge, Shots, profile, residuals, ridge, solve
+from bayessim_jax.inference.shooting import (
+    COMPILER_OPTIONS,
+    Fit,
+    Predict,
+    Ridge,
+    Shots,
+    profile,
+    residuals,
+    ridge,
+    solve,
+)
 
 __all__ = ["estimate_noise", "fit_direct", "sample_direct"]
 
@@ -30,8 +41,11 @@ STARTS = 3
 ROUNDS = 6
 """Rounds of noise estimate and fit, at most."""
 DRAWS = 512
-"""Laplace draws that are weighed, and how many of them have to be worth something."""
+"""Draws around Laplace's optimum that are weighed."""
 SOUND = 0.25
+"""Of them that have to be worth something."""
+FREEDOM = 7
+"""Degrees of freedom of Student's t, from which they are drawn."""
 SMOOTH = 0.15
 """Standard deviations of Laplace's by which resampled draws are spread, so that few of them coincide."""
 CHAINS, LENGTH = 64, 120
@@ -63,7 +77,7 @@ def noise_level(
 ) -> Float[Array, " obs"]:
     """√(Σ r² / (n (1 − k/N))) of every channel for k numbers fitted to N, or `floor`; 1 − k/N is at least `least`."""
     share = max(1.0 - fitted / max(counts.sum(), 1), least)
-    return jnp.maximum(jnp.asarray(np.sqrt(squares / np.maximum(counts * share, 1))), floor)
+    return jnp.asarray(np.maximum(np.sqrt(squares / np.maximum(counts * share, 1)), np.asarray(floor)))
 
 
 def noise_floor(shots: Shots) -> Float[Array, " obs"]:
@@ -100,13 +114,14 @@ def fit_direct(
     """
     windows, n = shots.y.shape[0], shots.spread.size
     floor = noise_floor(shots)
-    free = jnp.ones(d, bool)
+    free = np.ones(d, bool)
     run = lambda z, delta, sigma, count: solve(predict, shots, z, delta, sigma, free, steps=count, step=step)  # noqa: E731
     if start is None:
-        spread = jnp.asarray(_spreads(shots))
-        sigma = jnp.maximum(0.05 * spread, floor)
-        delta = jnp.zeros((windows, n))
-        points = jax.random.normal(key, (SCREENED, d)).at[0].set(0.0)
+        spread = _spreads(shots)
+        sigma = jnp.asarray(np.maximum(0.05 * spread, np.asarray(floor)))
+        delta = np.zeros((windows, n))
+        points = np.array(jax.random.normal(key, (SCREENED, d)))
+        points[0] = 0.0
         costs = np.asarray(_screen(predict, shots, points, delta, 0.3 * spread))
         order = np.argsort(np.where(np.isfinite(costs), costs, np.inf))
         chosen = [0, *[int(i) for i in order if i != 0 and np.isfinite(costs[i])][: starts if d else 0]]
@@ -122,7 +137,7 @@ def fit_direct(
         best = run(start.z, start.delta, start.sigma, steps)
     for _ in range(ROUNDS):
         sigma = estimate_noise(shots, best, floor)
-        change = float(jnp.abs(jnp.log(sigma / best.sigma)).max())
+        change = float(np.abs(np.log(np.asarray(sigma) / np.asarray(best.sigma))).max())
         best = run(best.z, best.delta, sigma, steps)
         if change < 0.02:
             break
@@ -135,15 +150,15 @@ def _spreads(shots: Shots) -> np.ndarray:
     return np.array([max(float(x.std()), 1e-9) if x.size else 1.0 for x in columns])
 
 
-def _screen_impl(predict: Predict, shots: Shots, points: Array, delta: Array, sigma: Array) -> Array:
+@partial(jax.jit, static_argnames="predict", compiler_options=COMPILER_OPTIONS)
+def _screen(predict: Predict, shots: Shots, points: Array, delta: Array, sigma: Array) -> Float[Array, " points"]:
+    """Cost of every point, each residual counted as ten of its σ at most; not finite where the simulation is not."""
+
     def one(z: Array) -> Array:
         r = residuals(predict, shots, z, delta, sigma)
         return jnp.minimum(r**2, 100.0).sum() + 0.0 * r.sum()
 
     return jax.lax.map(one, points, batch_size=16)
-
-
-_screen = jax.jit(_screen_impl, static_argnums=0)
 
 
 def sample_direct(
@@ -164,41 +179,70 @@ def sample_direct(
     at weighed draws. Without `exact` Laplace's Gaussian is drawn from as it is.
     """
     d = fit.z.size
-    factor = jnp.linalg.inv(jnp.linalg.cholesky(fit.precision)).T
     if not exact:
-        z = fit.z + jax.random.normal(key, (draws, d)) @ factor.T
-        return PosteriorDraws(jax.vmap(margins.theta)(z), z, fit, "laplace")
-    t_key, pick_key, chain_key = jax.random.split(key, 3)
-    nu = 7.0
-    normal_key, chi_key = jax.random.split(t_key)
-    chi = jax.random.chisquare(chi_key, nu, (DRAWS, 1)) / nu
-    white = jax.random.normal(normal_key, (DRAWS, d)) / jnp.sqrt(chi)
-    points = fit.z + white @ factor.T
-    around = ridge(fit)
-    log_target = _profiles(predict, shots, around, points)
-    log_proposal = -0.5 * (nu + d) * jnp.log1p((white**2).sum(-1) / nu)
-    log_weight = log_target - log_proposal
-    weight = jnp.exp(log_weight - log_weight.max())
-    weight = jnp.where(jnp.isfinite(weight), weight, 0.0)
-    efficiency = float(weight.sum() ** 2 / (weight**2).sum() / DRAWS)
-    if efficiency >= SOUND:
-        share = weight / weight.sum()
-        center = share @ points
-        z = points[jax.random.choice(pick_key, DRAWS, (draws,), p=share)]
-        jitter = SMOOTH * jax.random.normal(chain_key, (draws, d)) @ factor.T
-        z = center + (z + jitter - center) / np.sqrt(1 + SMOOTH**2)
-        return PosteriorDraws(jax.vmap(margins.theta)(z), z, fit, "laplace, weighed", efficiency)
-    if d > 1 and float(jnp.linalg.eigvalsh(fit.precision)[0]) < WIDE:
-        z = _walk(pick_key, predict, shots, fit, draws, step)
-        return PosteriorDraws(jax.vmap(margins.theta)(z), z, fit, "profile along the widest direction", efficiency)
-    first = points[jax.random.choice(pick_key, DRAWS, (CHAINS,), p=weight / weight.sum())]
-    z = _chains(chain_key, predict, shots, around, first, factor)
+        random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+        z = jnp.asarray(np.asarray(fit.z) + random.standard_normal((draws, d)) @ _factor(fit).T)
+        return PosteriorDraws(_values(margins, z), z, fit, "laplace")
+    weigh_key, chain_key = jax.random.split(key)
+    random = np.random.default_rng(np.asarray(jax.random.key_data(weigh_key)))
+    weighed = _weigh(random, predict, shots, fit, draws)
+    if weighed.efficiency >= SOUND:
+        return PosteriorDraws(_values(margins, weighed.z), weighed.z, fit, "laplace, weighed", weighed.efficiency)
+    if d > 1 and float(np.linalg.eigvalsh(np.asarray(fit.precision))[0]) < WIDE:
+        z = _walk(random, predict, shots, fit, draws, step)
+        return PosteriorDraws(_values(margins, z), z, fit, "profile along the widest direction", weighed.efficiency)
+    first = weighed.points[random.choice(DRAWS, CHAINS, p=weighed.share)]
+    z = _chains(chain_key, predict, shots, weighed.around, first, _factor(fit))
     z = z.reshape(-1, d)[:: max(z.size // d // draws, 1)]
-    return PosteriorDraws(jax.vmap(margins.theta)(z), z, fit, "random-walk Metropolis", efficiency)
+    return PosteriorDraws(_values(margins, z), z, fit, "random-walk Metropolis", weighed.efficiency)
+
+
+@dataclass(frozen=True)
+class _Weighed:
+    """Draws of Student's t around a fit, and of them again as the likelihood weighs them."""
+
+    around: Ridge
+    points: Float[np.ndarray, "points d"]
+    share: Float[np.ndarray, " points"]
+    efficiency: float
+    """Effective share of the points as an importance sample."""
+    z: Float[Array, "draws d"]
+
+
+def _weigh(random: np.random.Generator, predict: Predict, shots: Shots, fit: Fit, draws: int) -> _Weighed:
+    d, factor, around = fit.z.size, _factor(fit), ridge(fit)
+    chi = random.chisquare(FREEDOM, (DRAWS, 1)) / FREEDOM
+    white = random.standard_normal((DRAWS, d)) / np.sqrt(chi)
+    points = np.asarray(fit.z) + white @ factor.T
+    log_proposal = -0.5 * (FREEDOM + d) * np.log1p((white**2).sum(-1) / FREEDOM)
+    log_weight = np.asarray(_profiles(predict, shots, around, points)) - log_proposal
+    weight = np.nan_to_num(np.exp(log_weight - log_weight.max()))
+    share = weight / weight.sum()
+    center = share @ points
+    z = points[random.choice(DRAWS, draws, p=share)]
+    jitter = SMOOTH * random.standard_normal((draws, d)) @ factor.T
+    z = center + (z + jitter - center) / np.sqrt(1 + SMOOTH**2)
+    return _Weighed(around, points, share, float(1 / (share**2).sum() / DRAWS), jnp.asarray(z))
+
+
+@partial(jax.jit, static_argnames="predict", compiler_options=COMPILER_OPTIONS)
+def _profiles(predict: Predict, shots: Shots, around: Ridge, points: Array) -> Float[Array, " points"]:
+    return jax.lax.map(lambda z: profile(predict, shots, around, z), points, batch_size=16)
+
+
+def _factor(fit: Fit) -> Float[np.ndarray, "d d"]:
+    """A root of Laplace's covariance."""
+    return np.linalg.inv(np.linalg.cholesky(np.asarray(fit.precision))).T
+
+
+@jax.jit
+def _values(margins: Margins, z: Float[Array, "draws d"]) -> Float[Array, "draws d"]:
+    """In raw units."""
+    return jax.vmap(margins.theta)(z)
 
 
 def _walk(
-    key: PRNGKeyArray, predict: Predict, shots: Shots, fit: Fit, draws: int, step: float
+    random: np.random.Generator, predict: Predict, shots: Shots, fit: Fit, draws: int, step: float
 ) -> Float[Array, "draws d"]:
     """Draws along the widest direction of a fit, which may bend: a profile of it, walked step by step.
 
@@ -208,25 +252,26 @@ def _walk(
     Source: Raue et al. 2009 (profile likelihoods of ridges)
     """
     d = fit.z.size
-    basis = jnp.linalg.eigh(fit.precision)[1]  # smallest precision first
-    turned = dataclasses.replace(shots, center=basis.T @ (shots.center - fit.z))
+    basis = np.linalg.eigh(np.asarray(fit.precision))[1]  # smallest precision first
+    turned = dataclasses.replace(shots, center=jnp.asarray(basis.T @ np.asarray(shots.center - fit.z)))
 
     def along(a: Array, delta: Array, window: Any) -> Array:
         return predict(fit.z + basis @ a, delta, window)
 
-    free = jnp.arange(d) > 0
+    free = np.arange(d) > 0
     places, found = [], []
     for sign in (1.0, -1.0):
-        a, slope, delta = jnp.zeros(d), jnp.zeros(d), fit.delta
+        a, slope, delta = np.zeros(d), np.zeros(d), fit.delta
         for k in range(0 if sign > 0 else 1, WALK):
-            start = (a + STRIDE * sign * slope).at[0].set(sign * STRIDE * k)
+            start = a + STRIDE * sign * slope
+            start[0] = sign * STRIDE * k
             here = solve(along, turned, start, delta, fit.sigma, free, steps=STEPS, step=step)
-            if not bool(jnp.isfinite(here.cost)):
+            if not np.isfinite(float(here.cost)):
                 break
-            slope = (here.z - a) / (STRIDE * sign) if k else slope
-            a, delta = here.z, here.delta
-            rest = here.precision[1:, 1:]
-            log = -float(here.cost) - 0.5 * float(jnp.linalg.slogdet(rest)[1])
+            slope = (np.asarray(here.z) - a) / (STRIDE * sign) if k else slope
+            a, delta = np.asarray(here.z), here.delta
+            rest = np.asarray(here.precision)[1:, 1:]
+            log = -float(here.cost) - 0.5 * float(np.linalg.slogdet(rest)[1])
             places.append(sign * STRIDE * k)
             found.append((log, a, rest))
             if log < max(f[0] for f in found) - 10.0:
@@ -235,23 +280,16 @@ def _walk(
     grid, logs = np.array(places)[order], np.array([found[i][0] for i in order])
     fine = np.linspace(grid[0], grid[-1], 2001)
     density = np.exp(np.interp(fine, grid, logs) - logs.max())
-    pick_key, rest_key = jax.random.split(key)
-    shares = density / density.sum()
-    chosen = np.asarray(jax.random.choice(pick_key, jnp.asarray(fine), (draws,), p=jnp.asarray(shares)))
+    chosen = random.choice(fine, draws, p=density / density.sum())
     middle = np.stack([np.interp(chosen, grid, [float(found[i][1][j]) for i in order]) for j in range(d)], axis=-1)
     nearest = np.abs(chosen[:, None] - grid[None]).argmin(1)
-    white = np.asarray(jax.random.normal(rest_key, (draws, d - 1)))
-    factors = [np.linalg.inv(np.linalg.cholesky(np.asarray(found[i][2]))).T for i in order]
+    white = random.standard_normal((draws, d - 1))
+    factors = [np.linalg.inv(np.linalg.cholesky(found[i][2])).T for i in order]
     middle[:, 1:] += np.einsum("nij,nj->ni", np.array(factors)[nearest], white) if d > 1 else 0.0
-    return fit.z + jnp.asarray(middle) @ basis.T
+    return jnp.asarray(np.asarray(fit.z) + middle @ basis.T)
 
 
-@partial(jax.jit, static_argnames="predict")
-def _profiles(predict: Predict, shots: Shots, around: Ridge, points: Array) -> Array:
-    return jax.lax.map(lambda z: profile(predict, shots, around, z), points, batch_size=16)
-
-
-@partial(jax.jit, static_argnames="predict")
+@partial(jax.jit, static_argnames="predict", compiler_options=COMPILER_OPTIONS)
 def _chains(key: PRNGKeyArray, predict: Predict, shots: Shots, around: Ridge, first: Array, factor: Array) -> Array:
     """Random-walk Metropolis chains, side by side; the second half of each. Steps of many lengths pass bends."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +14,7 @@ from jaxtyping import Array, Float
 from bayessim_jax.beliefs.margins import Margins
 from bayessim_jax.systems.mjcf import MjcfSystem, displace
 
-__all__ = ["Inputs", "Restarted", "make_predictor", "replay_window"]
+__all__ = ["Inputs", "Replay", "Restarted", "replay_window"]
 
 
 @struct.dataclass
@@ -89,10 +88,22 @@ def replay_window(system: Any, theta: Array, delta: Float[Array, " n"], window: 
     return jnp.concatenate([first[None], after])
 
 
-def make_predictor(system: Any, margins: Margins) -> Callable[[Array, Array, Inputs], Array]:
-    """`predict(z, δ, window)` of a system whose parameters have these priors."""
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """`predict(z, δ, window)` of a system whose parameters have these priors.
 
-    def predict(z: Array, delta: Array, window: Inputs) -> Array:
-        return replay_window(system, margins.theta(z), delta, window)
+    Two of the same system and priors are equal, so that what was compiled for one serves the other.
+    """
 
-    return predict
+    system: Any
+    margins: Margins
+
+    def __call__(self, z: Float[Array, " d"], delta: Float[Array, " n"], window: Inputs) -> Float[Array, "rows obs"]:
+        """What the sensors show in every row."""
+        return replay_window(self.system, self.margins.theta(z), delta, window)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Replay) and other.system is self.system and other.margins == self.margins
+
+    def __hash__(self) -> int:
+        return hash((id(self.system), self.margins))

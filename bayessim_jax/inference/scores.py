@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from bayessim_jax.inference.shooting import Predict, Ridge, Shots
+from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Predict, Ridge, Shots
 
 __all__ = [
     "Errors",
@@ -25,6 +25,8 @@ __all__ = [
 
 BINS = 8
 """Stretches of lead time over which the spread of errors is estimated."""
+CHUNK = 32
+"""Windows that are predicted at a time."""
 
 
 @dataclass(frozen=True)
@@ -57,16 +59,24 @@ class Score:
 def predict_windows(
     predict: Predict, shots: Shots, z: Float[Array, " d"], delta: Float[Array, "windows n"] | None = None
 ) -> Float[np.ndarray, "windows rows obs"]:
-    """Predictions of every window from its recorded initial state, or from δ beside it."""
-    delta = jnp.zeros((shots.y.shape[0], shots.spread.size)) if delta is None else delta
-    return np.asarray(_predict(predict, shots.inputs, z, delta))
+    """Predictions of every window from its recorded initial state, or from δ beside it.
+
+    A chunk of windows is simulated at a time, so that one program serves however many there are.
+    """
+    windows = shots.y.shape[0]
+    still = np.zeros((windows, shots.spread.size), np.asarray(shots.spread).dtype)
+    every = jax.tree.map(np.asarray, (still if delta is None else delta, shots.inputs))
+    found = [np.zeros((0, *shots.y.shape[1:]))]
+    for first in range(0, windows, CHUNK):
+        which = np.minimum(np.arange(first, first + CHUNK), windows - 1)
+        moved, inputs = jax.tree.map(lambda x, which=which: x[which], every)
+        found.append(np.asarray(_predict(predict, inputs, z, moved)))
+    return np.concatenate(found)[:windows]
 
 
-def _predict_all(predict: Predict, inputs: Any, z: Array, delta: Array) -> Array:
+@partial(jax.jit, static_argnames="predict", compiler_options=COMPILER_OPTIONS)
+def _predict(predict: Predict, inputs: Any, z: Array, delta: Array) -> Float[Array, "windows rows obs"]:
     return jax.vmap(predict, in_axes=(None, 0, 0))(z, delta, inputs)
-
-
-_predict = jax.jit(_predict_all, static_argnums=0)
 
 
 def prediction_errors(predict: Predict, shots: Shots, z: Float[Array, " d"]) -> Errors:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from bayessim_jax.beliefs.margins import Margins
 from bayessim_jax.inference.amortised import sample_amortised
 from bayessim_jax.inference.direct import sample_direct
 from bayessim_jax.inference.draws import PosteriorDraws
@@ -158,8 +159,9 @@ def infer_case(
         wide = sample_direct(draw_key, settled.predict, settled.shots, *about, **options, exact=exact)
     posterior = wide.marginal(model.margins.size)
     say("predicting held-out windows")
-    prior_mean = jnp.asarray([p.prior.mean for p in model.case.parameters])
-    points = {"baseline": model.margins.standard(prior_mean), "posterior": posterior.z.mean(0)}
+    prior_mean = np.array([p.prior.mean for p in model.case.parameters])
+    every = np.asarray(posterior.z)
+    points = {"baseline": np.asarray(_standard(model.margins, prior_mean)), "posterior": every.mean(0)}
     scale, fit = channel_scale(shots, left), posterior.fit
     scores, predictions = {}, {}
     for name, z in points.items():
@@ -167,7 +169,7 @@ def infer_case(
         spread = error_spread(prediction_errors(predict, shots, z), scale)
         judged = compare(predictions[name], np.asarray(left.y), np.asarray(left.measured))
         scores[name] = score(judged, spread, scale, model.channels)
-    band = np.stack([predict_windows(predict, left, z) for z in posterior.z[:: max(draws // BAND, 1)][:BAND]])
+    band = np.stack([predict_windows(predict, left, z) for z in every[:: max(draws // BAND, 1)][:BAND]])
     return CaseInference(
         model=model,
         method=method,
@@ -180,6 +182,9 @@ def infer_case(
         noise_floor=smallest_error(ridge(fit), shots, start_spread(model, fit), scale),
         identifiability=find_unidentified(np.asarray(posterior.z), model.margins.names),
     )
+
+
+_standard = jax.jit(Margins.standard)
 
 
 def channel_scale(*shots: Shots) -> Float[np.ndarray, " obs"]:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from bayessim_jax.beliefs.margins import Margin, Margins, log_normal, normal, uniform
-from bayessim_jax.inference.replay import Inputs, Restarted, make_predictor
+from bayessim_jax.inference.replay import Inputs, Replay, Restarted
 from bayessim_jax.inference.scores import predict_windows
 from bayessim_jax.inference.shooting import Shots
 from bayessim_jax.recordings.priors import LogNormal, Normal, Prior
@@ -131,7 +132,9 @@ class CaseModel:
         )
         if self.step_error is None:
             return shots
-        return dataclasses.replace(shots, y=shots.y - self.step_error.offset(shots, self.refined))
+        return dataclasses.replace(
+            shots, y=jnp.asarray(np.asarray(shots.y) - self.step_error.offset(shots, self.refined))
+        )
 
     def inputs(self, windows: Windows) -> Inputs:
         """Initial states and commands; what came before, for effects that remember it, with smoothed motion."""
@@ -216,9 +219,9 @@ def tame(
 
 
 def lagrange(nodes: Sequence[float], at: Any) -> Any:
-    """Lagrange's polynomials of some nodes, at one place."""
-    parts = [[(at - b) / (a - b) for b in nodes if b != a] for a in nodes]
-    return jnp.stack([jnp.asarray(math.prod(part)) for part in parts])
+    """Lagrange's polynomials of some nodes, at one place, which may be traced."""
+    parts = [math.prod((at - b) / (a - b) for b in nodes if b != a) for a in nodes]
+    return jnp.stack(parts) if isinstance(at, jax.Array) else np.array(parts)
 
 
 def _coast(model: CaseModel, qpos: np.ndarray, moves: np.ndarray) -> np.ndarray:
@@ -309,9 +312,9 @@ def _bounds(prior: Prior) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def predictor(model: CaseModel) -> Callable[[Array, Array, Inputs], Array]:
+def predictor(model: CaseModel) -> Replay:
     """`predict(z, δ, window)` of a case: what its sensors show in every row of a window."""
-    return make_predictor(model.system, model.margins)
+    return Replay(model.system, model.margins)
 
 
 def split_windows(model: CaseModel) -> tuple[Windows, Windows]:
