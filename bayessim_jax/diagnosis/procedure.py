@@ -20,6 +20,7 @@ from bayessim_jax.diagnosis.bench import SLOTS, Bench, Candidate
 from bayessim_jax.diagnosis.response import Motion, cross_validate
 from bayessim_jax.diagnosis.scene import Scene
 from bayessim_jax.diagnosis.screen import LEAST_SHARE, Begun, Screen, Screened
+from bayessim_jax.diagnosis.simulated_scene import SimulatedScene
 from bayessim_jax.diagnosis.verdict import (
     Diagnosis,
     Entry,
@@ -36,6 +37,7 @@ from bayessim_jax.diagnosis.verdict import (
 from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, judge_misfit
 from bayessim_jax.effects import Scales
 from bayessim_jax.inference.direct import estimate_noise, noise_floor
+from bayessim_jax.inference.replay import Restarted
 from bayessim_jax.inference.shooting import Fit, Shots
 from bayessim_jax.systems.mjcf import MjcfSystem
 
@@ -106,7 +108,7 @@ class _Work:
 class Problem:
     """What a diagnosis is about: a system, what is believed of it, what may be missing, and windows of recordings."""
 
-    system: MjcfSystem
+    system: MjcfSystem | Restarted
     margins: Margins
     pairs: tuple[tuple[Any, str], ...]
     """Effects and places."""
@@ -114,8 +116,8 @@ class Problem:
     shots: Shots
     group: Int[np.ndarray, " windows"]
     """The recording of each window."""
-    motion: Motion
-    """The smoothed motion in the same windows."""
+    motion: Motion | None
+    """The smoothed motion in the same windows; None for a system without a model, which is simulated instead."""
     step: float = 0.0
     ahead: Shots | None = None
     """Windows as long as predictions are to be, to which nothing is fitted."""
@@ -124,10 +126,12 @@ class Problem:
         """Pairs to be held against some of the windows."""
         count = len(self.group)
         rows = np.unique(np.linspace(0, count - 1, min(SCREENED, count)).astype(int))
-        motion = jax.tree.map(lambda x: x[rows], self.motion)
-        shots = dataclasses.replace(self.shots, inputs=None, y=self.shots.y[rows], measured=self.shots.measured[rows])
-        scene = Scene(self.system, self.margins, pairs, self.scales, shots, motion, self.step, slots)
-        return Screen(scene)
+        motion, inputs = jax.tree.map(lambda x: x[rows], (self.motion, self.shots.inputs))
+        shots = dataclasses.replace(self.shots, inputs=inputs, y=self.shots.y[rows], measured=self.shots.measured[rows])
+        if isinstance(self.system, Restarted):
+            return Screen(SimulatedScene(Bench(self.system, self.margins, pairs, self.scales, shots, slots=slots)))
+        assert motion is not None
+        return Screen(Scene(self.system, self.margins, pairs, self.scales, shots, motion, self.step, slots))
 
     def bench(self, pairs: Sequence[tuple[Any, str]], slots: int = SLOTS) -> Bench:
         """A bench for some of the pairs."""
@@ -165,7 +169,8 @@ def name_effects(
 ) -> Diagnosis:
     """Find what a simulator lacks whose misfit was detected.
 
-    First every effect at every place along the recorded motion (`diagnosis.screen`); then the best of them are
+    First every effect at every place along the recorded motion (`diagnosis.screen`), or, in a system without a model,
+    simulated from few points; then the best of them are
     simulated on a bench of their own, pairs where one is not enough, and larger sets where the best pair is worth both
     of its effects and is not enough either.
     """
@@ -279,8 +284,9 @@ def _bench_of(key: PRNGKeyArray, problem: Problem, candidates: Sequence[Screened
     numbers = sorted({k for found in candidates for k in found.candidate.effects})
     bench = problem.bench([problem.pairs[k] for k in numbers])
     say(f"simulating {len(candidates)} candidates; compiling takes a while")
-    memory = problem.motion.past.shape[1] * problem.system.dt
-    remembered = np.asarray(problem.motion.start) > memory - 0.5 * problem.system.dt
+    inputs = problem.shots.inputs
+    memory = inputs.past.shape[1] * problem.system.dt
+    remembered = np.asarray(inputs.time) > memory - 0.5 * problem.system.dt
     enough = remembered if remembered.mean() > ENOUGH else None
     return _Work(key, bench, problem.group, noise_floor(bench.shots), say, enough, tuple(numbers))
 

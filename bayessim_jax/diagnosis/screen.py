@@ -19,6 +19,7 @@ from scipy.stats import norm
 from bayessim_jax.diagnosis.bench import NEAR, Candidate, begin_value
 from bayessim_jax.diagnosis.response import propose
 from bayessim_jax.diagnosis.scene import Scene
+from bayessim_jax.diagnosis.simulated_scene import SimulatedScene
 from bayessim_jax.diagnosis.whiteness import Misfit, judge_misfit
 from bayessim_jax.inference.direct import noise_floor, noise_level
 from bayessim_jax.inference.shooting import in_units
@@ -75,7 +76,7 @@ class Screened:
 class Screen:
     """Fits of candidates along the motion of a scene."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene | SimulatedScene) -> None:
         self.scene = scene
         self.shots, self.d, self.slots = scene.shots, scene.d, scene.slots
         self.pairs, self.name, self.takes, self.offsets = scene.pairs, scene.name, scene.takes, scene.offsets
@@ -182,7 +183,7 @@ class Screen:
         """The simulator without effects."""
         p = np.zeros(self.d + self.slots)
         p[: self.d] = z
-        delta = jnp.zeros((len(self.scene.motion.start), 2 * self.scene.model.nv))
+        delta = jnp.zeros((len(self.shots.y), self.shots.spread.size))
         found = self.settle(Candidate(), p, delta, sigma)
         if found is None:
             raise ValueError("the simulator diverges along the recorded motion.")

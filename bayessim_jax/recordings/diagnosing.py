@@ -22,7 +22,8 @@ from bayessim_jax.diagnosis.procedure import Problem, detect, is_mismatch, name_
 from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.diagnosis.screen import Screened
 from bayessim_jax.diagnosis.verdict import Diagnosis, Entry, Thresholds, share_left
-from bayessim_jax.effects import EFFECTS, Scales, effect_places, recorded_scales
+from bayessim_jax.effects import EFFECTS, Scales, commanded_scales, effect_places, recorded_scales
+from bayessim_jax.inference.replay import Restarted
 from bayessim_jax.inference.scores import Score, compare, error_spread, score
 from bayessim_jax.inference.shooting import Shots
 from bayessim_jax.recordings.experiments import advise, next_experiment
@@ -179,8 +180,6 @@ def _take_case(key: Array, model: CaseModel, effects: Sequence[Any], say: Callab
     system: Any = model.system
     pairs = tuple((effect, place) for effect in effects for place in effect_places(effect, system))
     joints = [f"joint/{name}" for name, *_ in model.case.layout.single]
-    rows = max(round(PIECE / model.system.dt), LEAST)
-    pieces = cut_windows(fitted, rows)
     whole = Problem(
         system=system,
         margins=model.margins,
@@ -188,13 +187,28 @@ def _take_case(key: Array, model: CaseModel, effects: Sequence[Any], say: Callab
         scales=_scales(model, [*(place for _, place in pairs), *joints]),
         shots=model.shots(fitted),
         group=fitted.recording,
-        motion=_motion(model, pieces, cut_windows(_thin(split_windows(model.smoothed)[0], MOST_FITTED), rows)),
+        motion=None,
         step=model.step,
     )
-    # as many windows as are predicted in the end, so that both are one program
-    ahead = model.shots(take(fitted, np.resize(np.arange(len(fitted)), len(windows))))
-    problem = dataclasses.replace(whole, shots=model.shots(pieces), group=pieces.recording, ahead=ahead)
+    pieces, problem = (fitted, whole) if isinstance(system, Restarted) else _cut(model, whole, fitted, len(windows))
     return _Taken(model, windows, np.arange(len(windows)) < len(fitted), pieces, whole, problem, settled)
+
+
+def _cut(model: CaseModel, whole: Problem, fitted: Windows, most: int) -> tuple[Windows, Problem]:
+    """Pieces of windows along their smoothed motion; predictions ahead are of `most` windows, some of them repeated."""
+    rows = max(round(PIECE / model.system.dt), LEAST)
+    pieces = cut_windows(fitted, rows)
+    smooth = cut_windows(_thin(split_windows(model.smoothed)[0], MOST_FITTED), rows)
+    # as many windows as are predicted in the end, so that both are one program
+    ahead = model.shots(take(fitted, np.resize(np.arange(len(fitted)), most)))
+    problem = dataclasses.replace(
+        whole,
+        shots=model.shots(pieces),
+        group=pieces.recording,
+        motion=_motion(model, pieces, smooth),
+        ahead=ahead,
+    )
+    return pieces, problem
 
 
 def _motion(model: CaseModel, windows: Windows, smooth: Windows) -> Motion:
@@ -207,10 +221,15 @@ def _motion(model: CaseModel, windows: Windows, smooth: Windows) -> Motion:
 
 def _scales(model: CaseModel, places: Sequence[str]) -> dict[str, Scales]:
     """How large things are at every place, over all recordings."""
-    qpos, qvel, ctrl = (np.concatenate([getattr(r, n) for r in model.recordings]) for n in ("qpos", "qvel", "ctrl"))
+    qpos, qvel, sensors, ctrl = (
+        np.concatenate([getattr(r, n) for r in model.recordings]) for n in ("qpos", "qvel", "sensors", "ctrl")
+    )
     duration = max(float(r.time[-1] - r.time[0]) for r in model.recordings)
-    m, dt = model.compiled, model.system.dt
-    return {place: recorded_scales(m, place, qpos, qvel, ctrl, dt, duration) for place in dict.fromkeys(places)}
+    places, dt = list(dict.fromkeys(places)), model.system.dt
+    if isinstance(model.system, Restarted):
+        return {place: commanded_scales(model.system, place, sensors, ctrl, dt, duration) for place in places}
+    m = model.compiled
+    return {place: recorded_scales(m, place, qpos, qvel, ctrl, dt, duration) for place in places}
 
 
 def join(first: Windows, second: Windows) -> Windows:
@@ -368,21 +387,28 @@ def _locations(taken: _Taken, result: Diagnosis, residual: _Residual | None) -> 
     every = np.maximum(result.baseline.misfit.excess, 0.0)
     names = [model.recordings[i].name for i in pieces.recording]
     when = find_windows_of(every.sum(1), names, pieces.start, float(pieces.time.max()))
-    if residual is None:
-        return _by_channel(model, every.sum(0), when)
     shares = _shares_of_effects(model, result)
+    if residual is None:
+        if not shares:
+            return _by_channel(model, every.sum(0), when)
+        return [Location(place, share, "everywhere", when) for place, share in _largest(shares)]
     if not all(_joint_of(model, place) in residual.forces for place in shares) or not shares:
         shares = dict(zip(residual.places, residual.shares.tolist(), strict=True))
-    ranked = sorted(shares.items(), key=lambda item: -item[1])
-    kept = [item for k, item in enumerate(ranked) if k == 0 or item[1] >= SMALLEST]
-    total = max(sum(share for _, share in kept), 1e-12)
     found = []
-    for place, share in kept:
+    for place, share in _largest(shares):
         joint = _joint_of(model, place)
         force, position, velocity, drive, time = residual.forces[joint]
         regime = find_regime(force, position, velocity, drive, time, result.bench.scales[joint])
-        found.append(Location(place, round(share / total, 4), regime, when))
+        found.append(Location(place, share, regime, when))
     return found
+
+
+def _largest(shares: dict[str, float]) -> list[tuple[str, float]]:
+    """Places and their shares, largest first, without the small ones; what is left sums to one."""
+    ranked = sorted(shares.items(), key=lambda item: -item[1])
+    kept = [item for k, item in enumerate(ranked) if k == 0 or item[1] >= SMALLEST]
+    total = max(sum(share for _, share in kept), 1e-12)
+    return [(place, round(share / total, 4)) for place, share in kept]
 
 
 def _shares_of_effects(model: CaseModel, result: Diagnosis) -> dict[str, float]:
@@ -416,6 +442,8 @@ def _by_channel(
 def _joint_of(model: CaseModel, place: str) -> str:
     """The joint at which an effect's place is felt; the place itself where there is none."""
     kind, _, rest = place.partition("/")
+    if isinstance(model.system, Restarted):
+        return place
     m = model.compiled
     if kind == "actuator":
         joint = int(m.actuator(rest).trnid[0])
