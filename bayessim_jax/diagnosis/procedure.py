@@ -122,6 +122,11 @@ class Problem:
     ahead: Shots | None = None
     """Windows as long as predictions are to be, to which nothing is fitted."""
 
+    @cached_property
+    def every(self) -> Screen:
+        """All pairs, to be held against some of the windows."""
+        return self.screen(self.pairs)
+
     def screen(self, pairs: Sequence[tuple[Any, str]], slots: int = SLOTS) -> Screen:
         """Pairs to be held against some of the windows."""
         count = len(self.group)
@@ -175,7 +180,7 @@ def name_effects(
     of its effects and is not enough either.
     """
     thresholds = thresholds or Thresholds()
-    screen, start = problem.screen(problem.pairs), detected.fit
+    screen, start = problem.every, detected.fit
     screens = [screen, *(screen.twin() for _ in range(1, WORKERS))]
     say(f"holding {len(problem.pairs)} candidates against the recorded motion")
     nothing = screen.begin(start.z[: screen.d], start.sigma)

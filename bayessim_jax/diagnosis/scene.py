@@ -140,6 +140,10 @@ class Scene:
         moved = np.where(self._steps(candidate), p - around.p, 0.0)
         return assess(around.lin, around.windowed, forcing, moved, p, delta, sigma)
 
+    def states(self, delta: Float[Array, "windows n"]) -> list[Float[Array, "windows n"]]:
+        """Initial states to begin from beside those of a fit: none, for every fit is close to the recorded motion."""
+        return [delta]
+
     def begin_around(self, p: Float[Array, " k"]) -> None:
         """Linearize around the θ of a point; what a fit finds then does not depend on the fits before it."""
         key = np.asarray(p)[: self.d].tobytes()

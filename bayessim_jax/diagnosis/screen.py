@@ -197,7 +197,7 @@ class Screen:
         strayed = (np.arange(self.d + self.slots) < self.d) & (np.abs(known.p) > STRAYED)
         if strayed.any():
             points += [np.where(strayed, 0.0, point) for point in points]
-        ends: list[tuple[Any, ...]] = [(p, known.delta) for p in points]
+        ends: list[tuple[Any, ...]] = [(p, delta) for p in points for delta in self.scene.states(known.delta)]
         weighs = any(p.unit in INERTIAS for k in added.effects for p in self.scene.parameters[k])
         bad = BAD * known.cost if weighs else np.inf
         for steps, scanned, kept in RACES:

@@ -64,6 +64,10 @@ class SimulatedScene:
             self._shots[candidate] = self.bench.setup(candidate)
         return _assess(self.bench.predict, self._shots[candidate], jnp.asarray(p), delta, sigma)
 
+    def states(self, delta: Float[Array, "windows n"]) -> list[Float[Array, "windows n"]]:
+        """Initial states to begin from: those of a fit, and the recorded ones, which no misfit has moved."""
+        return [delta, jnp.zeros_like(delta)]
+
     def begin_around(self, p: Float[Array, " k"]) -> None:
         """Nothing is kept from fit to fit."""
 

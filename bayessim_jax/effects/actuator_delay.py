@@ -13,7 +13,7 @@ from bayessim_jax.effects.history import RECENT
 
 __all__ = ["ActuatorDelay"]
 
-LEAST, MOST = 8, 400
+LEAST, MOST = 16, 400
 """The fewest and the most time steps that are remembered: the longest delay is longer or shorter for it."""
 
 
@@ -21,7 +21,7 @@ class ActuatorDelay(ActEffect):
     """u(t) ↦ u(t − T), T any fraction of a time step.
 
     A command that is held from one time step to the next arrives, on average over a time step n, as
-    (1 − f) u[n − k] + f u[n − k − 1] with T/h = k + f. T in s, 0.1 at most, or eight time steps where that is longer.
+    (1 − f) u[n − k] + f u[n − k − 1] with T/h = k + f. T in s, 0.1 at most, or 16 time steps where these are longer.
     """
 
     name = "actuator_delay"

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from bayessim_jax.diagnosis.absorbed import find_absorbed
 from bayessim_jax.diagnosis.belief import moments_of_effects, moments_of_theta
 from bayessim_jax.diagnosis.bench import Bench, Candidate
 from bayessim_jax.diagnosis.experiment import Experiment
@@ -21,6 +22,7 @@ from bayessim_jax.diagnosis.locate import Location, find_regime, find_windows_of
 from bayessim_jax.diagnosis.procedure import Problem, detect, is_mismatch, name_effects
 from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.diagnosis.screen import Screened
+from bayessim_jax.diagnosis.simulated_scene import SimulatedScene
 from bayessim_jax.diagnosis.verdict import Diagnosis, Entry, Thresholds, share_left
 from bayessim_jax.effects import EFFECTS, Scales, commanded_scales, effect_places, recorded_scales
 from bayessim_jax.inference.replay import Restarted
@@ -71,6 +73,8 @@ class CaseDiagnosis:
     """Mean and standard deviation of the parameters, `baseline` and `augmented`."""
     experiment: Experiment | None
     """What would tell the members of the confusion set apart."""
+    absorbed: list[str]
+    """Effects whose place the parameters can take, of a system that is simulated from the start."""
 
     @property
     def shares_left(self) -> list[float]:
@@ -102,6 +106,7 @@ class CaseDiagnosis:
                 for place in self.locations
             ],
             "effects": self._effects(best) if named else [],
+            "absorbed": [name for name in self.absorbed if not (named and name in best.names)],
             "confusion_set": [entry.names for entry in result.confusion] if result.verdict == "ambiguous" else [],
             "fit": {
                 "horizon": self.model.case.case.horizon,
@@ -226,8 +231,9 @@ def _scales(model: CaseModel, places: Sequence[str]) -> dict[str, Scales]:
     )
     duration = max(float(r.time[-1] - r.time[0]) for r in model.recordings)
     places, dt = list(dict.fromkeys(places)), model.system.dt
+    plain: Any = model.system
     if isinstance(model.system, Restarted):
-        return {place: commanded_scales(model.system, place, sensors, ctrl, dt, duration) for place in places}
+        return {place: commanded_scales(plain, place, sensors, ctrl, dt, duration) for place in places}
     m = model.compiled
     return {place: recorded_scales(m, place, qpos, qvel, ctrl, dt, duration) for place in places}
 
@@ -307,7 +313,14 @@ def diagnose_case(
             "augmented": moments_of_theta(bench, result.confusion or [result.best], result.probabilities or [1.0]),
         },
         experiment=next_experiment(model, bench, result, shots),
+        absorbed=_absorbed(taken.problem, none),
     )
+
+
+def _absorbed(problem: Problem, none: Entry) -> list[str]:
+    """What the parameters can take the place of, where candidates are simulated and not held against a motion."""
+    scene = problem.every.scene if isinstance(problem.system, Restarted) and problem.pairs else None
+    return find_absorbed(scene, none.fit.z, none.fit.sigma) if isinstance(scene, SimulatedScene) else []
 
 
 def _floor(bench: Bench, entry: Entry, scale: np.ndarray, model: CaseModel, shots: Shots) -> float:
@@ -338,8 +351,8 @@ class _Residual:
 def _fit_residual_force(key: Array, taken: _Taken, none: Entry) -> _Residual | None:
     """A flexible force at all joints, what each joint alone explains, and the forces along the recordings."""
     model, problem = taken.model, taken.problem
-    joints = model.case.layout.single
-    if not joints:
+    joints, motion = model.case.layout.single, problem.motion
+    if not joints or motion is None:
         return None
     places = [f"joint/{name}" for name, _, _ in joints]
     scales = {p: problem.scales[p] for p in places}
@@ -357,7 +370,7 @@ def _fit_residual_force(key: Array, taken: _Taken, none: Entry) -> _Residual | N
         left.append(1.0 if alone is None else share_left(screen.misfit(key, alone), before))
     bench = problem.bench(pairs, slots)
     weights = np.asarray(jnp.stack([bench.each[0].value(z) for z in found.p[bench.d :]]))
-    motion, gears, forces = problem.motion, _gears(model), {}
+    gears, forces = _gears(model), {}
     rows = taken.pieces.valid
     time = (taken.pieces.start[:, None] + taken.pieces.time[:, :-1])[rows]
     for k, (place, (_, q, v)) in enumerate(zip(places, joints, strict=True)):
