@@ -21,8 +21,8 @@ __all__ = ["Misfit", "difference_noise", "judge_misfit"]
 
 MODES = 8
 """Cosines of a window that count as slow, beside the mean: a sensor or a base that is off shows there alone."""
-DEPENDENT = 1e-9
-"""Share of the largest column's length that another column has beside those before it, if it is one of its own."""
+ROUNDED = 1e3
+"""Times the precision of numbers: a column that is no longer beside the others is nothing but rounding."""
 BOOTSTRAPS = 400
 FALSE_ALARMS = 0.05
 
@@ -70,7 +70,8 @@ def _basis(columns: Array) -> Array:
     """Orthonormal columns with the span of some, and zeros where these depend on others, as what is known does."""
     q, r = jnp.linalg.qr(columns)
     size = jnp.abs(jnp.diagonal(r, axis1=-2, axis2=-1))
-    return q * (size > DEPENDENT * size.max(-1, keepdims=True))[:, None]
+    least = ROUNDED * jnp.finfo(size.dtype).eps * size.max(-1, keepdims=True)
+    return q * (size > least)[:, None]
 
 
 def _absorb(r: Array, q: Array) -> Array:

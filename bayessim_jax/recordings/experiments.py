@@ -28,6 +28,10 @@ HINTS = {
     "feels it: from command and position of one joint alone the two delays cannot be told apart",
     frozenset({"actuator_bias", "sensor_offset"}): "the joint held at several known angles",
     frozenset({"viscous_friction", "back_emf"}): "motion with the motor off (open circuit)",
+    frozenset(
+        {"actuator_gain"}
+    ): "what one of the actuators gives for a known command: a weaker one beside another is a "
+    "stronger one beside that, with other parameters",
     frozenset({"actuator_gain", "armature"}): "a known load held still, and then fast motion",
 }
 """What to measure where no command of the library helps."""

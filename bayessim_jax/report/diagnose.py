@@ -172,7 +172,7 @@ def _entries(diagnosis: CaseDiagnosis) -> str:
     for entry in diagnosis.result.entries:
         named = "yes" if entry in diagnosis.result.confusion else ""
         left = share_left(entry.misfit, base.misfit)
-        shares = (f"{100 * share:.2g} %" for share in (left, entry.ahead))
+        shares = (f"{number(100 * share, 2)} %" for share in (left, entry.ahead))
         rows.append([" + ".join(entry.names), number(entry.score - base.score, 4), *shares, named])
     return html.table(["finalist", "gain on recordings left out", "misfit left", "error ahead left", "named"], rows)
 
