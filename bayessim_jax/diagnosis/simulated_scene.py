@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from bayessim_jax.beliefs.margins import Margin
 from bayessim_jax.diagnosis.bench import Bench, Candidate
+from bayessim_jax.effects.commanded import EVERY
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Curvature, Shots, expand, normal_equations
 
 __all__ = ["SimulatedScene"]
@@ -45,8 +46,10 @@ class SimulatedScene:
         return " + ".join(self.bench.names(candidate)) or "nothing"
 
     def takes(self, candidate: Candidate) -> bool:
-        """Whether it has not too many parameters."""
-        return self.count(candidate) <= self.slots
+        """Whether it can be tried: not an effect of all actuators and of one, nor with too many parameters."""
+        alike = {self.pairs[k][0].name for k in candidate.effects if self.pairs[k][1] == EVERY}
+        apart = {self.pairs[k][0].name for k in candidate.effects if self.pairs[k][1] != EVERY}
+        return not alike & apart and self.count(candidate) <= self.slots
 
     def offsets(self, candidate: Candidate) -> list[tuple[int, slice]]:
         """Every effect of a candidate and the places of its parameters in p = [θ's z, x, zeros]."""

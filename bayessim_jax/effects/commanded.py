@@ -17,7 +17,10 @@ from bayessim_jax.effects.places import Site, at
 from bayessim_jax.effects.rig import AugmentedState
 from bayessim_jax.effects.wiring import Wired
 
-__all__ = ["AugmentedSystem", "find_commands"]
+__all__ = ["EVERY", "AugmentedSystem", "find_commands"]
+
+EVERY = "actuator/*"
+"""The place of an effect on all actuators alike."""
 
 
 @struct.dataclass
@@ -147,6 +150,8 @@ def find_commands(system: System[Any], place: str) -> Site:
     """The actions that a place names, or `ValueError`."""
     if not isinstance(system.actions, Box):
         raise ValueError(f"place {place!r}: this system's actions are a choice among few; effects need numbers.")
+    if place == EVERY and system.actions.size > 1:
+        return Site(actuators=tuple(range(system.actions.size)))
     names = [name.removeprefix("actuator/") for name in place.split("#")]
     for name in names:
         if name not in system.actions.names:

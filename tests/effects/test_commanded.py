@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bayessim_jax.effects import EFFECTS, Scales, commanded_scales, with_effects
+from bayessim_jax.effects import EFFECTS, Scales, commanded_scales, effect_places, with_effects
 from bayessim_jax.inference.replay import Inputs, replay_window
 from bayessim_jax.systems import SkidSteer
 
-LEFT = "actuator/input/left"
+LEFT, RIGHT = "actuator/input/left", "actuator/input/right"
 THETA = jnp.array([0.07, 0.5, 0.1])
 POSE = jnp.array([0.3, -0.2, 0.4])
 
@@ -36,6 +36,31 @@ def test_a_delay_hands_on_the_commands_before():
         state = machine.step(theta, state, jnp.array([9.0, 0.0]))
         moved.append(float(state.base.speed))
     np.testing.assert_allclose(moved, [0.035 * u for u in (5.0, 3.0, 9.0)], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("actuator_lag", 0.3), ("actuator_delay", 0.12), ("actuator_deadband", 1.5)]
+)
+def test_an_effect_on_all_actuators_is_the_same_one_on_each(name, value):
+    alike, apart = vehicle((name, "actuator/*")), vehicle((name, LEFT), (name, RIGHT))
+    rows = jnp.asarray(np.random.default_rng(1).uniform(-5, 5, (8, 2)))
+    shown = []
+    for machine, own in ((alike, [value]), (apart, [value, value])):
+        theta = jnp.append(THETA, jnp.array(own))
+        state = machine.begin(theta, POSE, rows)
+        for row in rows:
+            state = machine.step(theta, state, row)
+        shown.append(machine.observe(theta, state))
+    np.testing.assert_allclose(*shown, rtol=1e-6)
+
+
+def test_places_in_a_vehicle_are_its_actuators_all_of_them_and_its_channels():
+    robot = SkidSteer.create()
+    places = {name: effect_places(EFFECTS[name], robot) for name in EFFECTS}
+    assert places["actuator_lag"] == [LEFT, RIGHT, "actuator/*"]
+    assert places["wheel_slip"] == [f"{LEFT}#{RIGHT}"]
+    assert places["sensor_scale"] == ["base/x", "base/y", "base/yaw"]
+    assert not places["sensor_delay"] and not places["back_emf"] and not places["coulomb_friction"]
 
 
 def test_delays_reach_over_many_control_periods_however_long_these_are():

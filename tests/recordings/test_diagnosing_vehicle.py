@@ -17,7 +17,7 @@ from tests.recordings.vehicle_case import THETA, Vehicle, write_case
 
 ROOT = Path(__file__).parents[2]
 CASES = Path(os.environ.get("BAYESSIM_CASES", ROOT.parent / "shared" / "data" / "cases"))
-LEFT, RIGHT = "actuator/input/left", "actuator/input/right"
+LEFT, RIGHT, BOTH = "actuator/input/left", "actuator/input/right", "actuator/*"
 
 
 def diagnosed(folder, vehicle, seed=0):
@@ -106,7 +106,7 @@ def test_a_delay_of_both_sides_is_named(tmp_path, seed):
     table = diagnosed(tmp_path, Vehicle(delay=0.2), seed)
     assert table["verdict"] == "explained"
     wanted = {"seconds": pytest.approx(0.2, abs=0.02)}
-    assert named(table) == {("actuator_delay", LEFT): wanted, ("actuator_delay", RIGHT): wanted}
+    assert named(table) == {("actuator_delay", BOTH): wanted}
 
 
 @pytest.mark.slow
