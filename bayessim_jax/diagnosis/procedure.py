@@ -255,7 +255,7 @@ class _Growth:
         self.alone = {each.candidate.effects[0]: screens[0].own(each) for each in begun}
 
     def extend(self, known: Screened) -> list[Screened]:
-        """The best sets of the known effects and another one."""
+        """The best sets of the known effects and another one, or with one of them on each actuator by itself."""
         first = self.screens[0]
         wider = {known.candidate + Candidate((k,)): k for k in range(len(first.pairs))}
         larger = len(known.candidate.effects) + 1
@@ -267,11 +267,17 @@ class _Growth:
         # a glance may miss what its general case shows
         best += [s for s in tried if s not in best and any(self._is_special_case(wider[s], wider[b]) for b in best)]
 
-        def finish(screen: Screen, candidate: Candidate) -> Screened | None:
-            started = screen.begin_candidate(candidate, known)
-            return screen.finish_candidate(started, known) if started is not None else None
+        grown = [(s, known) for s in best]
+        split = [(s, first.part(known, kept)) for s, kept in first.scene.apart(known.candidate)]
+        split = [(s, kept) for s, kept in split if s not in self.seen and first.takes(s)]
+        self.seen.update(s for s, _ in split)
 
-        return [each for each in _each(self.screens, best, finish) if each is not None]
+        def finish(screen: Screen, item: tuple[Candidate, Screened]) -> Screened | None:
+            candidate, beside = item
+            started = screen.begin_candidate(candidate, beside)
+            return screen.finish_candidate(started, beside) if started is not None else None
+
+        return [each for each in _each(self.screens, [*grown, *split], finish) if each is not None]
 
     def _is_special_case(self, effect: int, other: int) -> bool:
         """Whether an effect is a special case of another one at the same joint."""
@@ -362,7 +368,7 @@ def _pair(key: PRNGKeyArray, growth: _Growth, nothing: Screened, ranked: Sequenc
     members = [Candidate((k,)) for k in best.candidate.effects]
     for member in members:
         if member not in led:
-            found += growth.extend(first.part(best, member.effects[0]))
+            found += growth.extend(first.part(best, member.effects))
     if first.misfit(key, best).p_value < FALSE_ALARMS:
         names = [first.name(member) for member in members]
         kin = [each for each in ranked if any(are_kin(first.name(each.candidate), name) for name in names)]

@@ -117,6 +117,10 @@ class Scene:
         placed = (self.pairs[k][0].port == "model" or self.sites[k].joint >= 0 for k in candidate.effects)
         return all(placed) and self.count(candidate) <= self.slots
 
+    def apart(self, candidate: Candidate) -> list[tuple[Candidate, tuple[int, ...]]]:
+        """What stands for an effect of several actuators with one for each: nothing, for each has its own here."""
+        return []
+
     def offsets(self, candidate: Candidate) -> list[tuple[int, slice]]:
         """Every effect of a candidate and the places of its parameters in p = [θ's z, x, zeros]."""
         found, first = [], self.d

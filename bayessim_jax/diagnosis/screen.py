@@ -222,13 +222,14 @@ class Screen:
         best = min(ends, key=lambda end: float(end[2].cost))
         return self.settle(begun.candidate, best[0], best[1], known.sigma)
 
-    def part(self, found: Screened, effect: int) -> Screened:
-        """One effect of a candidate by itself, with the numbers that it has there."""
+    def part(self, found: Screened, effects: tuple[int, ...]) -> Screened:
+        """Some effects of a candidate by themselves, with the numbers that they have there."""
+        part, held = Candidate(effects), dict(self.offsets(found.candidate))
         p = np.zeros(self.d + self.slots)
         p[: self.d] = found.p[: self.d]
-        place = dict(self.offsets(found.candidate))[effect]
-        p[self.d : self.d + place.stop - place.start] = found.p[place]
-        return replace(found, candidate=Candidate((effect,)), p=jnp.asarray(p))
+        for k, place in self.offsets(part):
+            p[place] = found.p[held[k]]
+        return replace(found, candidate=part, p=jnp.asarray(p))
 
     def misfit(self, key: PRNGKeyArray, found: Screened) -> Misfit:
         """What a candidate leaves of the misfit."""

@@ -51,6 +51,17 @@ class SimulatedScene:
         apart = {self.pairs[k][0].name for k in candidate.effects if self.pairs[k][1] != EVERY}
         return not alike & apart and self.count(candidate) <= self.slots
 
+    def apart(self, candidate: Candidate) -> list[tuple[Candidate, tuple[int, ...]]]:
+        """A candidate with an effect of all actuators on each of them instead, and which of its effects it keeps."""
+        found = []
+        for k in candidate.effects:
+            effect, place = self.pairs[k]
+            if place == EVERY:
+                each = (i for i, (other, where) in enumerate(self.pairs) if other is effect and where != EVERY)
+                kept = tuple(i for i in candidate.effects if i != k)
+                found.append((Candidate(kept) + Candidate(tuple(each)), kept))
+        return found
+
     def offsets(self, candidate: Candidate) -> list[tuple[int, slice]]:
         """Every effect of a candidate and the places of its parameters in p = [θ's z, x, zeros]."""
         found, first = [], self.d
