@@ -110,7 +110,8 @@ def start_spread(model: CaseModel, fit: Fit) -> Float[np.ndarray, " n"]:
     found = fit.usual_move
     if isinstance(model.system, Restarted):
         size = model.system.observations.size
-        return np.concatenate([fit.sigma, found[size:]]) if size == len(model.channels) else found
+        unrecorded = np.zeros(len(found) - size)  # commands that nobody recorded are no noise
+        return np.concatenate([fit.sigma, unrecorded]) if size == len(model.channels) else found
     joints, nv = model.case.layout.single, model.system.engine.model.nv
     sigma = dict(zip(model.channels, np.asarray(fit.sigma), strict=True))
     names = {v: (f"joint/{name}/qpos", f"joint/{name}/qvel") for name, _, v in joints}
