@@ -194,7 +194,9 @@ def name_effects(
     entries = _finish(work, none, singles, problem.ahead, thresholds)
     left = share_left(entries[0].misfit, none.misfit) if entries else 1.0
     explained = bool(entries) and explains(entries[0], none, thresholds)
-    if left > thresholds.enough or not explained or entries[0].ahead > thresholds.doubtful:
+    # where nothing is predicted ahead, what shows in the windows themselves is all that tells of another effect
+    shows = explained and problem.ahead is None and entries[0].misfit.p_value < FALSE_ALARMS
+    if left > thresholds.enough or not explained or shows or entries[0].ahead > thresholds.doubtful:
         say("one effect is not enough: trying pairs")
         before = screen.misfit(key, nothing)
         remain = lambda found: share_left(screen.misfit(key, found), before)  # noqa: E731

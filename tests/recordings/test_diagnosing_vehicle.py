@@ -113,6 +113,16 @@ def test_a_delay_of_both_sides_is_named(tmp_path, seed):
 
 
 @pytest.mark.slow
+def test_a_lag_does_not_stand_for_a_delay_beside_it(tmp_path):
+    """A longer lag leaves a hundredth of the misfit, which shows."""
+    table = diagnosed(tmp_path, Vehicle(lag=(0.17, 0.17), delay=0.1))
+    assert named(table) == {
+        ("actuator_delay", BOTH): {"seconds": pytest.approx(0.1, abs=0.015)},
+        ("actuator_lag", BOTH): {"time_constant": pytest.approx(0.17, abs=0.02)},
+    }
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("slip", [0.0, 0.2])
 @pytest.mark.parametrize("seed", range(3))
 def test_nothing_is_missing_where_slip_is_a_smaller_and_wider_vehicle(tmp_path, slip, seed):
