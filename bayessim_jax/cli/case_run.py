@@ -57,9 +57,6 @@ class CaseRun:
             loaded = load_case(case, mask=bool(settings["mask"])).check()
             if not loaded.parameters and name == "infer":
                 raise ValueError(f"{case}: case.toml names no parameters to infer; add [[parameters]].")
-            if loaded.model is None and name == "diagnose":
-                what = f"{case}: system {loaded.case.system} is a registered one"
-                raise ValueError(f"{what}, and effects are tried on MuJoCo models only; give the model as MJCF.")
             folder = RunFolder(out or Path("runs") / f"{loaded.case.folder.resolve().name}-{name}").create()
         except ValueError as error:
             raise UsageError(str(error)) from error

@@ -21,8 +21,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from bayessim_jax.beliefs.margins import Margin, Margins, log_uniform, uniform
 from bayessim_jax.effects import EffectParameter, Scales, at, with_effects
-from bayessim_jax.effects.places import find_site
-from bayessim_jax.inference.replay import Inputs, replay_window
+from bayessim_jax.effects.wiring import Wired
+from bayessim_jax.inference.replay import Inputs, Restarted, replay_window
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Fit, Shots, solve
 from bayessim_jax.systems.mjcf import MjcfSystem
 
@@ -65,7 +65,7 @@ class Bench:
 
     def __init__(
         self,
-        system: MjcfSystem,
+        system: MjcfSystem | Restarted,
         margins: Margins,
         pairs: Sequence[tuple[Any, str]],
         scales: Mapping[str, Scales],
@@ -77,11 +77,11 @@ class Bench:
         self.scales = scales
         plain: Any = system
         self.union = with_effects(plain, self.pairs, scales) if self.pairs else plain
-        self.channels = tuple(c.name for c in system.channels)
+        self.channels = system.observations.names
         self.shots = shots
-        wired = self.union.effects if self.pairs else ()
-        self.parameters = [p for w in wired for p in w.parameters]
-        self.first = np.cumsum([0, *(len(w.parameters) for w in wired)])
+        self.wired: tuple[Wired, ...] = self.union.effects if self.pairs else ()
+        self.parameters = [p for w in self.wired for p in w.parameters]
+        self.first = np.cumsum([0, *(len(w.parameters) for w in self.wired)])
         self.each: list[Margin] = [margin_of_effect(p) for p in self.parameters]
         self.neutral = np.array([p.neutral for p in self.parameters])
 
@@ -111,12 +111,12 @@ class Bench:
 
     def seats(self, candidate: Candidate) -> dict[str, str]:
         """Names of a candidate's effects on actuators, and the same at the joint that is driven."""
-        model, found = self.union.engine.model, {}
+        found = {}
         for k in candidate.effects:
             effect, place = self.pairs[k]
-            joint = find_site(model, place).joint
+            joint = self.wired[k].site.joint
             if place.startswith("actuator/") and joint >= 0:
-                found[self.name(k)] = f"{effect.name}@joint/{model.joint(joint).name}"
+                found[self.name(k)] = f"{effect.name}@joint/{self.union.engine.model.joint(joint).name}"
         return found
 
     def columns(self, candidate: Candidate) -> list[int]:

@@ -20,6 +20,7 @@ from bayessim_jax.diagnosis.bench import SLOTS, Bench, Candidate
 from bayessim_jax.diagnosis.response import Motion, cross_validate
 from bayessim_jax.diagnosis.scene import Scene
 from bayessim_jax.diagnosis.screen import LEAST_SHARE, Begun, Screen, Screened
+from bayessim_jax.diagnosis.simulated_scene import SimulatedScene
 from bayessim_jax.diagnosis.verdict import (
     Diagnosis,
     Entry,
@@ -36,6 +37,7 @@ from bayessim_jax.diagnosis.verdict import (
 from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, judge_misfit
 from bayessim_jax.effects import Scales
 from bayessim_jax.inference.direct import estimate_noise, noise_floor
+from bayessim_jax.inference.replay import Restarted
 from bayessim_jax.inference.shooting import Fit, Shots
 from bayessim_jax.systems.mjcf import MjcfSystem
 
@@ -106,7 +108,7 @@ class _Work:
 class Problem:
     """What a diagnosis is about: a system, what is believed of it, what may be missing, and windows of recordings."""
 
-    system: MjcfSystem
+    system: MjcfSystem | Restarted
     margins: Margins
     pairs: tuple[tuple[Any, str], ...]
     """Effects and places."""
@@ -114,20 +116,27 @@ class Problem:
     shots: Shots
     group: Int[np.ndarray, " windows"]
     """The recording of each window."""
-    motion: Motion
-    """The smoothed motion in the same windows."""
+    motion: Motion | None
+    """The smoothed motion in the same windows; None for a system without a model, which is simulated instead."""
     step: float = 0.0
     ahead: Shots | None = None
     """Windows as long as predictions are to be, to which nothing is fitted."""
+
+    @cached_property
+    def every(self) -> Screen:
+        """All pairs, to be held against some of the windows."""
+        return self.screen(self.pairs)
 
     def screen(self, pairs: Sequence[tuple[Any, str]], slots: int = SLOTS) -> Screen:
         """Pairs to be held against some of the windows."""
         count = len(self.group)
         rows = np.unique(np.linspace(0, count - 1, min(SCREENED, count)).astype(int))
-        motion = jax.tree.map(lambda x: x[rows], self.motion)
-        shots = dataclasses.replace(self.shots, inputs=None, y=self.shots.y[rows], measured=self.shots.measured[rows])
-        scene = Scene(self.system, self.margins, pairs, self.scales, shots, motion, self.step, slots)
-        return Screen(scene)
+        motion, inputs = jax.tree.map(lambda x: x[rows], (self.motion, self.shots.inputs))
+        shots = dataclasses.replace(self.shots, inputs=inputs, y=self.shots.y[rows], measured=self.shots.measured[rows])
+        if isinstance(self.system, Restarted):
+            return Screen(SimulatedScene(Bench(self.system, self.margins, pairs, self.scales, shots, slots=slots)))
+        assert motion is not None
+        return Screen(Scene(self.system, self.margins, pairs, self.scales, shots, motion, self.step, slots))
 
     def bench(self, pairs: Sequence[tuple[Any, str]], slots: int = SLOTS) -> Bench:
         """A bench for some of the pairs."""
@@ -165,12 +174,13 @@ def name_effects(
 ) -> Diagnosis:
     """Find what a simulator lacks whose misfit was detected.
 
-    First every effect at every place along the recorded motion (`diagnosis.screen`); then the best of them are
+    First every effect at every place along the recorded motion (`diagnosis.screen`), or, in a system without a model,
+    simulated from few points; then the best of them are
     simulated on a bench of their own, pairs where one is not enough, and larger sets where the best pair is worth both
     of its effects and is not enough either.
     """
     thresholds = thresholds or Thresholds()
-    screen, start = problem.screen(problem.pairs), detected.fit
+    screen, start = problem.every, detected.fit
     screens = [screen, *(screen.twin() for _ in range(1, WORKERS))]
     say(f"holding {len(problem.pairs)} candidates against the recorded motion")
     nothing = screen.begin(start.z[: screen.d], start.sigma)
@@ -184,7 +194,9 @@ def name_effects(
     entries = _finish(work, none, singles, problem.ahead, thresholds)
     left = share_left(entries[0].misfit, none.misfit) if entries else 1.0
     explained = bool(entries) and explains(entries[0], none, thresholds)
-    if left > thresholds.enough or not explained or entries[0].ahead > thresholds.doubtful:
+    # where nothing is predicted ahead, what shows in the windows themselves is all that tells of another effect
+    shows = explained and problem.ahead is None and entries[0].misfit.p_value < FALSE_ALARMS
+    if left > thresholds.enough or not explained or shows or entries[0].ahead > thresholds.doubtful:
         say("one effect is not enough: trying pairs")
         before = screen.misfit(key, nothing)
         remain = lambda found: share_left(screen.misfit(key, found), before)  # noqa: E731
@@ -245,7 +257,7 @@ class _Growth:
         self.alone = {each.candidate.effects[0]: screens[0].own(each) for each in begun}
 
     def extend(self, known: Screened) -> list[Screened]:
-        """The best sets of the known effects and another one."""
+        """The best sets of the known effects and another one, or with one of them on each actuator by itself."""
         first = self.screens[0]
         wider = {known.candidate + Candidate((k,)): k for k in range(len(first.pairs))}
         larger = len(known.candidate.effects) + 1
@@ -257,11 +269,17 @@ class _Growth:
         # a glance may miss what its general case shows
         best += [s for s in tried if s not in best and any(self._is_special_case(wider[s], wider[b]) for b in best)]
 
-        def finish(screen: Screen, candidate: Candidate) -> Screened | None:
-            started = screen.begin_candidate(candidate, known)
-            return screen.finish_candidate(started, known) if started is not None else None
+        grown = [(s, known) for s in best]
+        split = [(s, first.part(known, kept)) for s, kept in first.scene.apart(known.candidate)]
+        split = [(s, kept) for s, kept in split if s not in self.seen and first.takes(s)]
+        self.seen.update(s for s, _ in split)
 
-        return [each for each in _each(self.screens, best, finish) if each is not None]
+        def finish(screen: Screen, item: tuple[Candidate, Screened]) -> Screened | None:
+            candidate, beside = item
+            started = screen.begin_candidate(candidate, beside)
+            return screen.finish_candidate(started, beside) if started is not None else None
+
+        return [each for each in _each(self.screens, [*grown, *split], finish) if each is not None]
 
     def _is_special_case(self, effect: int, other: int) -> bool:
         """Whether an effect is a special case of another one at the same joint."""
@@ -279,8 +297,9 @@ def _bench_of(key: PRNGKeyArray, problem: Problem, candidates: Sequence[Screened
     numbers = sorted({k for found in candidates for k in found.candidate.effects})
     bench = problem.bench([problem.pairs[k] for k in numbers])
     say(f"simulating {len(candidates)} candidates; compiling takes a while")
-    memory = problem.motion.past.shape[1] * problem.system.dt
-    remembered = np.asarray(problem.motion.start) > memory - 0.5 * problem.system.dt
+    inputs = problem.shots.inputs
+    memory = inputs.past.shape[1] * problem.system.dt
+    remembered = np.asarray(inputs.time) > memory - 0.5 * problem.system.dt
     enough = remembered if remembered.mean() > ENOUGH else None
     return _Work(key, bench, problem.group, noise_floor(bench.shots), say, enough, tuple(numbers))
 
@@ -351,7 +370,7 @@ def _pair(key: PRNGKeyArray, growth: _Growth, nothing: Screened, ranked: Sequenc
     members = [Candidate((k,)) for k in best.candidate.effects]
     for member in members:
         if member not in led:
-            found += growth.extend(first.part(best, member.effects[0]))
+            found += growth.extend(first.part(best, member.effects))
     if first.misfit(key, best).p_value < FALSE_ALARMS:
         names = [first.name(member) for member in members]
         kin = [each for each in ranked if any(are_kin(first.name(each.candidate), name) for name in names)]

@@ -117,6 +117,10 @@ class Scene:
         placed = (self.pairs[k][0].port == "model" or self.sites[k].joint >= 0 for k in candidate.effects)
         return all(placed) and self.count(candidate) <= self.slots
 
+    def apart(self, candidate: Candidate) -> list[tuple[Candidate, tuple[int, ...]]]:
+        """What stands for an effect of several actuators with one for each: nothing, for each has its own here."""
+        return []
+
     def offsets(self, candidate: Candidate) -> list[tuple[int, slice]]:
         """Every effect of a candidate and the places of its parameters in p = [θ's z, x, zeros]."""
         found, first = [], self.d
@@ -139,6 +143,10 @@ class Scene:
         forcing = _assemble(around.windowed.seen, pushes, sensed, self.model.nv, p.size)
         moved = np.where(self._steps(candidate), p - around.p, 0.0)
         return assess(around.lin, around.windowed, forcing, moved, p, delta, sigma)
+
+    def states(self, delta: Float[Array, "windows n"]) -> list[Float[Array, "windows n"]]:
+        """Initial states to begin from beside those of a fit: none, for every fit is close to the recorded motion."""
+        return [delta]
 
     def begin_around(self, p: Float[Array, " k"]) -> None:
         """Linearize around the θ of a point; what a fit finds then does not depend on the fits before it."""

@@ -19,6 +19,7 @@ from scipy.stats import norm
 from bayessim_jax.diagnosis.bench import NEAR, Candidate, begin_value
 from bayessim_jax.diagnosis.response import propose
 from bayessim_jax.diagnosis.scene import Scene
+from bayessim_jax.diagnosis.simulated_scene import SimulatedScene
 from bayessim_jax.diagnosis.whiteness import Misfit, judge_misfit
 from bayessim_jax.inference.direct import noise_floor, noise_level
 from bayessim_jax.inference.shooting import in_units
@@ -75,7 +76,7 @@ class Screened:
 class Screen:
     """Fits of candidates along the motion of a scene."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene | SimulatedScene) -> None:
         self.scene = scene
         self.shots, self.d, self.slots = scene.shots, scene.d, scene.slots
         self.pairs, self.name, self.takes, self.offsets = scene.pairs, scene.name, scene.takes, scene.offsets
@@ -182,7 +183,7 @@ class Screen:
         """The simulator without effects."""
         p = np.zeros(self.d + self.slots)
         p[: self.d] = z
-        delta = jnp.zeros((len(self.scene.motion.start), 2 * self.scene.model.nv))
+        delta = jnp.zeros((len(self.shots.y), self.shots.spread.size))
         found = self.settle(Candidate(), p, delta, sigma)
         if found is None:
             raise ValueError("the simulator diverges along the recorded motion.")
@@ -196,7 +197,7 @@ class Screen:
         strayed = (np.arange(self.d + self.slots) < self.d) & (np.abs(known.p) > STRAYED)
         if strayed.any():
             points += [np.where(strayed, 0.0, point) for point in points]
-        ends: list[tuple[Any, ...]] = [(p, known.delta) for p in points]
+        ends: list[tuple[Any, ...]] = [(p, delta) for p in points for delta in self.scene.states(known.delta)]
         weighs = any(p.unit in INERTIAS for k in added.effects for p in self.scene.parameters[k])
         bad = BAD * known.cost if weighs else np.inf
         for steps, scanned, kept in RACES:
@@ -221,13 +222,14 @@ class Screen:
         best = min(ends, key=lambda end: float(end[2].cost))
         return self.settle(begun.candidate, best[0], best[1], known.sigma)
 
-    def part(self, found: Screened, effect: int) -> Screened:
-        """One effect of a candidate by itself, with the numbers that it has there."""
+    def part(self, found: Screened, effects: tuple[int, ...]) -> Screened:
+        """Some effects of a candidate by themselves, with the numbers that they have there."""
+        part, held = Candidate(effects), dict(self.offsets(found.candidate))
         p = np.zeros(self.d + self.slots)
         p[: self.d] = found.p[: self.d]
-        place = dict(self.offsets(found.candidate))[effect]
-        p[self.d : self.d + place.stop - place.start] = found.p[place]
-        return replace(found, candidate=Candidate((effect,)), p=jnp.asarray(p))
+        for k, place in self.offsets(part):
+            p[place] = found.p[held[k]]
+        return replace(found, candidate=part, p=jnp.asarray(p))
 
     def misfit(self, key: PRNGKeyArray, found: Screened) -> Misfit:
         """What a candidate leaves of the misfit."""

@@ -24,6 +24,8 @@ __all__ = ["Misfit", "difference_noise", "judge_misfit"]
 
 MODES = 8
 """Cosines of a window that count as slow, beside the mean: a sensor or a base that is off shows there alone."""
+ROUNDED = 1e3
+"""Times the precision of numbers: a column that is no longer beside the others is nothing but rounding."""
 BOOTSTRAPS = 400
 FALSE_ALARMS = 0.05
 
@@ -67,6 +69,14 @@ def _slow(r: Array, cosines: Array) -> Array:
     return (jnp.einsum("mr,wro->wmo", cosines, r) ** 2).sum(1)
 
 
+def _basis(columns: Array) -> Array:
+    """Orthonormal columns with the span of some, and zeros where these depend on others, as what is known does."""
+    q, r = jnp.linalg.qr(columns)
+    size = jnp.abs(jnp.diagonal(r, axis1=-2, axis2=-1))
+    least = ROUNDED * jnp.finfo(size.dtype).eps * size.max(-1, keepdims=True)
+    return q * (size > least)[:, None]
+
+
 def _absorb(r: Array, q: Array) -> Array:
     """What windows' initial states leave of residuals; `q` is a basis of what they can explain."""
     flat = r.reshape(len(r), -1)
@@ -107,7 +117,7 @@ def judge_misfit(
     noise = np.maximum(difference_noise(residual, measured), 1e-300)
     rows, obs = measured.shape[1:]
     slopes = (slopes.reshape(*slopes.shape[:2], rows, obs) / noise).reshape(slopes.shape)
-    q, _ = jnp.linalg.qr(jnp.swapaxes(slopes, 1, 2))
+    q = _basis(jnp.swapaxes(slopes, 1, 2))
     cosines, there = jnp.asarray(_cosines(rows)), jnp.asarray(measured)
     power = np.asarray(_slow(jnp.asarray(np.where(measured, residual / noise, 0.0)), cosines))
     error = jnp.where(there, jnp.asarray(known / noise * np.ones(measured.shape)), 0.0)

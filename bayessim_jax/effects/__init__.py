@@ -16,4 +16,5 @@ from bayessim_jax.effects.places import joints as joints
 from bayessim_jax.effects.registry import EFFECTS as EFFECTS
 from bayessim_jax.effects.registry import lookup_effect as lookup_effect
 from bayessim_jax.effects.registry import register_effect as register_effect
+from bayessim_jax.effects.scaling import commanded_scales as commanded_scales
 from bayessim_jax.effects.scaling import recorded_scales as recorded_scales

@@ -13,15 +13,15 @@ from bayessim_jax.effects.history import RECENT
 
 __all__ = ["ActuatorDelay"]
 
-MOST = 400
-"""The most time steps that are remembered, which makes the longest delay shorter where time steps are short."""
+LEAST, MOST = 16, 400
+"""The fewest and the most time steps that are remembered: the longest delay is longer or shorter for it."""
 
 
 class ActuatorDelay(ActEffect):
     """u(t) ↦ u(t − T), T any fraction of a time step.
 
     A command that is held from one time step to the next arrives, on average over a time step n, as
-    (1 − f) u[n − k] + f u[n − k − 1] with T/h = k + f. T in s, 0.1 at most.
+    (1 − f) u[n − k] + f u[n − k − 1] with T/h = k + f. T in s, 0.1 at most, or 16 time steps where these are longer.
     """
 
     name = "actuator_delay"
@@ -65,7 +65,7 @@ class ActuatorDelay(ActEffect):
 
 def samples_back(h: float) -> int:
     """How many earlier time steps are remembered."""
-    return min(math.ceil(RECENT / h - 1e-9), MOST)
+    return min(max(math.ceil(RECENT / h - 1e-9), LEAST), MOST)
 
 
 def _split(steps: Scalar, back: int) -> tuple[Scalar, Scalar]:

@@ -22,7 +22,7 @@ class ActuatorLag(ActEffect):
 
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The time constant T."""
-        high = max(0.5, 5.0 * scales.period)
+        high = max(0.5, 20.0 * scales.period)
         return (EffectParameter("time_constant", "s", 0.0, high, 0.0, max(0.02, scales.timestep), form=0.01),)
 
     def begin(self, values: Values, command: Any, moment: Moment) -> Memory:

@@ -10,8 +10,9 @@ import mujoco
 import numpy as np
 
 from bayessim_jax.contracts import Box, System
+from bayessim_jax.effects.alike import Alike
 from bayessim_jax.effects.augmented import AugmentedMjcf
-from bayessim_jax.effects.commanded import AugmentedSystem, find_commands
+from bayessim_jax.effects.commanded import EVERY, AugmentedSystem, find_commands
 from bayessim_jax.effects.contract import Scales
 from bayessim_jax.effects.drive import least_share
 from bayessim_jax.effects.places import Site, find_site
@@ -33,7 +34,7 @@ def effect_places(effect: Any, system: System[Any]) -> list[str]:
         seen = {c.name for c in system.channels}
         return places if effect.port != "sense" else [p for p in places if p in seen]
     if effect.port == "act" and isinstance(system.actions, Box):
-        return [] if effect.looks else effect.choose(system.actions.names)
+        return [] if effect.looks else _actuators(effect, system.actions.names)
     return list(system.observations.names) if effect.port == "sense" and not effect.remembers else []
 
 
@@ -58,8 +59,15 @@ def with_effects(
         ):
             raise ValueError(f"{effect.name}@{place}: only a system made of a MuJoCo model takes this effect.")
     sites = [find_commands(system, p) if e.port == "act" else _observed(system, p) for e, p in effects]
-    wired = assign(effects, sites, scales, system.parameters.size)
+    spread = [(Alike(e) if p == EVERY else e, p) for e, p in effects]
+    wired = assign(spread, sites, scales, system.parameters.size)
     return AugmentedSystem(extend_box(system.parameters, wired), system, wired)
+
+
+def _actuators(effect: Any, names: Sequence[str]) -> list[str]:
+    """Where an effect on actuators can act; what acts on any one of several can act on all of them alike."""
+    places = effect.choose(names)
+    return [*places, EVERY] if len(places) == len(names) > 1 else places
 
 
 def _augment(

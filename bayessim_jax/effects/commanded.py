@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -16,7 +17,10 @@ from bayessim_jax.effects.places import Site, at
 from bayessim_jax.effects.rig import AugmentedState
 from bayessim_jax.effects.wiring import Wired
 
-__all__ = ["AugmentedSystem", "find_commands"]
+__all__ = ["EVERY", "AugmentedSystem", "find_commands"]
+
+EVERY = "actuator/*"
+"""The place of an effect on all actuators alike."""
 
 
 @struct.dataclass
@@ -53,6 +57,34 @@ class AugmentedSystem:
         """An initial state of the system without effects, at time 0."""
         return self.resume(theta, self.base.reset(key, theta[: self.base.parameters.size]))
 
+    def begin(
+        self,
+        theta: Float[Array, " d"],
+        observation: Float[Array, " obs"],
+        past: Float[Array, "periods act"],
+        time: Scalar | float = 0.0,
+    ) -> AugmentedState:
+        """The state that shows this observation, `time` seconds into a recording, after these commands.
+
+        One row for each control period before, the most recent last; the first had been held for long.
+        """
+        for w in reversed([w for w in self.effects if w.effect.port == "sense"]):
+            c = self.observations.names.index(at(w.place))
+            moment = Moment(jnp.asarray(time), self.dt, position=observation[c])
+            observation = observation.at[c].set(w.effect.restore(w.values(theta), moment)[0])
+        base: Any = self.base
+        begun = self.resume(
+            theta,
+            base.restart(theta[: self.base.parameters.size], observation),
+            past[0],
+            time - len(past) * self.dt,
+        )
+
+        def once(state: AugmentedState, action: Float[Array, " act"]) -> tuple[AugmentedState, None]:
+            return replace(self._command(theta, state, action)[1], time=state.time + self.dt), None
+
+        return jax.lax.scan(once, begun, past)[0]
+
     def resume(
         self,
         theta: Float[Array, " d"],
@@ -76,14 +108,20 @@ class AugmentedSystem:
 
     def step(self, theta: Float[Array, " d"], state: AugmentedState, action: Float[Array, " act"]) -> AugmentedState:
         """Advance by one control period."""
+        arrived, state = self._command(theta, state, action)
+        base = self.base.step(theta[: self.base.parameters.size], state.base, arrived)
+        return replace(state, base=base, time=state.time + self.dt)
+
+    def _command(
+        self, theta: Float[Array, " d"], state: AugmentedState, action: Float[Array, " act"]
+    ) -> tuple[Float[Array, " act"], AugmentedState]:
+        """What arrives of an action, and the state whose effects have seen it."""
         commands: list[Any] = [action[k] for k in range(self.actions.size)]
-        memories = list(state.memories)
-        moment = Moment(state.time, self.dt)
+        memories, moment = {}, Moment(state.time, self.dt)
         for k, w in enumerate(self.effects):
             if w.effect.port == "act":
-                commands, memories[k] = pass_one(w, theta, memories[k], commands, moment)
-        base = self.base.step(theta[: self.base.parameters.size], state.base, jnp.stack(commands))
-        return AugmentedState(base, tuple(memories), (), state.time + self.dt)
+                commands, memories[k] = pass_one(w, theta, state.memories[k], commands, moment)
+        return jnp.stack(commands), state.with_memories(memories)
 
     def replay(
         self, theta: Float[Array, " d"], state: AugmentedState, actions: Float[Array, "periods act"]
@@ -112,6 +150,8 @@ def find_commands(system: System[Any], place: str) -> Site:
     """The actions that a place names, or `ValueError`."""
     if not isinstance(system.actions, Box):
         raise ValueError(f"place {place!r}: this system's actions are a choice among few; effects need numbers.")
+    if place == EVERY and system.actions.size > 1:
+        return Site(actuators=tuple(range(system.actions.size)))
     names = [name.removeprefix("actuator/") for name in place.split("#")]
     for name in names:
         if name not in system.actions.names:

@@ -203,7 +203,8 @@ class ActEffect(Effect, Protocol):
     hurries: bool = False
     """Whether `ahead` is quicker than `command` at every time step."""
     brief: bool = False
-    """Whether it remembers no more than `history.RECENT` s of commands; other memories do not depend on the step."""
+    """Whether it remembers no more than the commands of `history.RECENT` s or of a few time steps; other memories do
+    not depend on the step."""
 
     def choose(self, names: Sequence[str]) -> list[str]:
         """The places among actuators of these names: each of them, unless it takes several."""

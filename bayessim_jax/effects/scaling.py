@@ -8,13 +8,15 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from bayessim_jax.contracts import System
+from bayessim_jax.effects.commanded import find_commands
 from bayessim_jax.effects.contract import Scales
 from bayessim_jax.effects.directions import link_axes
 from bayessim_jax.effects.drive import actuators_of, nominal_inertia
 from bayessim_jax.effects.places import at, find_body, find_site, movable_bodies
 from bayessim_jax.engines.contacts import find_partners
 
-__all__ = ["recorded_scales"]
+__all__ = ["commanded_scales", "recorded_scales"]
 
 ROWS = 200
 """Rows of a recording at which gravity's and the motion's part of the force are looked at."""
@@ -47,6 +49,18 @@ def recorded_scales(
     if other >= 0:
         scales |= {f"other_{name}": value for name, value in _of_motion(model, other, qpos, qvel).items()}
     return Scales(**scales)
+
+
+def commanded_scales(
+    system: System[Any], place: str, observations: Rows, commands: Rows, period: float, duration: float
+) -> Scales:
+    """The scales of an actuator or an observation of a system without a model, from what was recorded of it."""
+    scales: dict[str, Any] = {"period": period, "duration": duration, "timestep": period}
+    if at(place) not in system.observations.names:
+        return Scales(**scales, command=_most(commands[:, list(find_commands(system, place).actuators)]))
+    c = system.observations.names.index(at(place))
+    seen, unit = observations[:, c], system.observations.units[c]
+    return Scales(**scales, position=_most(seen - seen.mean()), centre=float(seen.mean()), unit=unit)
 
 
 def _of_motion(model: mujoco.MjModel, joint: int, qpos: Rows, qvel: Rows) -> dict[str, Any]:

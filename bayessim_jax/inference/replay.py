@@ -9,9 +9,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from bayessim_jax.beliefs.margins import Margins
+from bayessim_jax.contracts import Box, Discrete
+from bayessim_jax.effects.commanded import AugmentedSystem
 from bayessim_jax.systems.mjcf import MjcfSystem, displace
 
 __all__ = ["Inputs", "Replay", "Restarted", "replay_window"]
@@ -31,6 +33,8 @@ class Inputs:
     """When the window begins, s in its recording."""
     motion: tuple[Float[Array, "before nq"], Float[Array, "before nv"]] | None = None
     """Positions and velocities in the rows before the window, at rest before the recording begins."""
+    unrecorded: Bool[Array, " before"] | None = None
+    """Rows before the recording begins, whose commands are not known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +45,8 @@ class Restarted:
     """
 
     system: Any
+    parameters: Box
+    """Of θ."""
     others: Float[Array, " e"]
     index: tuple[int, ...]
     """Place of each of θ among the system's parameters."""
@@ -50,30 +56,53 @@ class Restarted:
     substeps = 1
 
     @property
+    def actions(self) -> Box | Discrete:
+        """The system's."""
+        return self.system.actions
+
+    @property
+    def observations(self) -> Box:
+        """The system's."""
+        return self.system.observations
+
+    @property
+    def noise(self) -> Float[Array, " obs"]:
+        """The system's."""
+        return self.system.noise
+
+    @property
     def dt(self) -> float:
         """One control period, s."""
         return self.system.dt
 
-    def replay(self, theta: Array, observation: Float[Array, " obs"], ctrl: Array) -> Float[Array, "rows obs"]:
-        """Observations of every row, from the one that the first row shows."""
-        full = self.others.at[jnp.asarray(self.index)].set(theta)
+    def reset(self, key: PRNGKeyArray, theta: Float[Array, " d"]) -> Any:
+        """The system's."""
+        return self.system.reset(key, self._full(theta))
 
-        def once(state: Any, action: Array) -> tuple[Any, Array]:
-            after = self.system.step(full, state, action)
-            return after, self.system.observe(full, after)
+    def restart(self, theta: Float[Array, " d"], observation: Float[Array, " obs"]) -> Any:
+        """The state that shows this observation."""
+        return self.system.restart(self._full(theta), observation)
 
-        state = self.system.restart(full, observation)
-        after = jax.lax.scan(once, state, ctrl)[1]
-        return jnp.concatenate([self.system.observe(full, state)[None], after])
+    def step(self, theta: Float[Array, " d"], state: Any, action: Float[Array, " act"]) -> Any:
+        """Advance by one control period."""
+        return self.system.step(self._full(theta), state, action)
+
+    def observe(self, theta: Float[Array, " d"], state: Any) -> Float[Array, " obs"]:
+        """What the sensors show."""
+        return self.system.observe(self._full(theta), state)
+
+    def _full(self, theta: Float[Array, " d"]) -> Float[Array, " e"]:
+        return self.others.at[jnp.asarray(self.index, int)].set(theta)
 
 
 def replay_window(system: Any, theta: Array, delta: Float[Array, " n"], window: Inputs) -> Float[Array, "rows obs"]:
     """What the sensors show in every row of a window that begins δ beside the recorded state.
 
-    `system` is an `MjcfSystem`, one with effects, or `Restarted`, whose observations stand under `qpos`.
+    `system` is an `MjcfSystem` or `Restarted`, or one of them with effects. Observations of a restarted one stand under
+    `qpos`; what follows these in δ is added to commands from before the recording.
     """
-    if isinstance(system, Restarted):
-        return system.replay(theta, window.qpos + delta, window.ctrl)
+    if isinstance(system, (Restarted, AugmentedSystem)):
+        return _replay_restarted(system, theta, delta, window)
     nv = system.engine.model.nv
     qpos, qvel = displace(system.engine.model, window.qpos, delta[:nv]), window.qvel + delta[nv:]
     commanded = window.ctrl.shape[-1] > 0
@@ -86,6 +115,28 @@ def replay_window(system: Any, theta: Array, delta: Float[Array, " n"], window: 
     first = system.observe(theta, state)
     after = jax.vmap(system.observe, in_axes=(None, 0))(theta, system.replay(theta, state, window.ctrl))
     return jnp.concatenate([first[None], after])
+
+
+def _replay_restarted(
+    system: Restarted | AugmentedSystem, theta: Array, delta: Float[Array, " n"], window: Inputs
+) -> Float[Array, "rows obs"]:
+    """The same for a system without a model."""
+    size = system.observations.size
+    shown = window.qpos + delta[:size]
+    if isinstance(system, Restarted):
+        first = system.restart(theta, shown)
+    else:
+        past = window.past
+        if window.unrecorded is not None:
+            past = past + jnp.where(window.unrecorded[:, None], delta[size:], 0.0)
+        first = system.begin(theta, shown, past, window.time)
+
+    def once(state: Any, action: Array) -> tuple[Any, Array]:
+        after = system.step(theta, state, action)
+        return after, system.observe(theta, after)
+
+    after = jax.lax.scan(once, first, window.ctrl)[1]
+    return jnp.concatenate([system.observe(theta, first)[None], after])
 
 
 @dataclass(frozen=True, eq=False)

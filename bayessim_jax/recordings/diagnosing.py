@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from bayessim_jax.diagnosis.absorbed import find_absorbed
 from bayessim_jax.diagnosis.belief import moments_of_effects, moments_of_theta
 from bayessim_jax.diagnosis.bench import Bench, Candidate
 from bayessim_jax.diagnosis.experiment import Experiment
@@ -21,8 +22,10 @@ from bayessim_jax.diagnosis.locate import Location, find_regime, find_windows_of
 from bayessim_jax.diagnosis.procedure import Problem, detect, is_mismatch, name_effects
 from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.diagnosis.screen import Screened
+from bayessim_jax.diagnosis.simulated_scene import SimulatedScene
 from bayessim_jax.diagnosis.verdict import Diagnosis, Entry, Thresholds, share_left
-from bayessim_jax.effects import EFFECTS, Scales, effect_places, recorded_scales
+from bayessim_jax.effects import EFFECTS, Scales, commanded_scales, effect_places, recorded_scales
+from bayessim_jax.inference.replay import Restarted
 from bayessim_jax.inference.scores import Score, compare, error_spread, score
 from bayessim_jax.inference.shooting import Shots
 from bayessim_jax.recordings.experiments import advise, next_experiment
@@ -70,6 +73,8 @@ class CaseDiagnosis:
     """Mean and standard deviation of the parameters, `baseline` and `augmented`."""
     experiment: Experiment | None
     """What would tell the members of the confusion set apart."""
+    absorbed: list[str]
+    """Effects whose place the parameters can take, of a system that is simulated from the start."""
 
     @property
     def shares_left(self) -> list[float]:
@@ -101,6 +106,7 @@ class CaseDiagnosis:
                 for place in self.locations
             ],
             "effects": self._effects(best) if named else [],
+            "absorbed": [name for name in self.absorbed if not (named and name in best.names)],
             "confusion_set": [entry.names for entry in result.confusion] if result.verdict == "ambiguous" else [],
             "fit": {
                 "horizon": self.model.case.case.horizon,
@@ -179,8 +185,6 @@ def _take_case(key: Array, model: CaseModel, effects: Sequence[Any], say: Callab
     system: Any = model.system
     pairs = tuple((effect, place) for effect in effects for place in effect_places(effect, system))
     joints = [f"joint/{name}" for name, *_ in model.case.layout.single]
-    rows = max(round(PIECE / model.system.dt), LEAST)
-    pieces = cut_windows(fitted, rows)
     whole = Problem(
         system=system,
         margins=model.margins,
@@ -188,13 +192,28 @@ def _take_case(key: Array, model: CaseModel, effects: Sequence[Any], say: Callab
         scales=_scales(model, [*(place for _, place in pairs), *joints]),
         shots=model.shots(fitted),
         group=fitted.recording,
-        motion=_motion(model, pieces, cut_windows(_thin(split_windows(model.smoothed)[0], MOST_FITTED), rows)),
+        motion=None,
         step=model.step,
     )
-    # as many windows as are predicted in the end, so that both are one program
-    ahead = model.shots(take(fitted, np.resize(np.arange(len(fitted)), len(windows))))
-    problem = dataclasses.replace(whole, shots=model.shots(pieces), group=pieces.recording, ahead=ahead)
+    pieces, problem = (fitted, whole) if isinstance(system, Restarted) else _cut(model, whole, fitted, len(windows))
     return _Taken(model, windows, np.arange(len(windows)) < len(fitted), pieces, whole, problem, settled)
+
+
+def _cut(model: CaseModel, whole: Problem, fitted: Windows, most: int) -> tuple[Windows, Problem]:
+    """Pieces of windows along their smoothed motion; predictions ahead are of `most` windows, some of them repeated."""
+    rows = max(round(PIECE / model.system.dt), LEAST)
+    pieces = cut_windows(fitted, rows)
+    smooth = cut_windows(_thin(split_windows(model.smoothed)[0], MOST_FITTED), rows)
+    # as many windows as are predicted in the end, so that both are one program
+    ahead = model.shots(take(fitted, np.resize(np.arange(len(fitted)), most)))
+    problem = dataclasses.replace(
+        whole,
+        shots=model.shots(pieces),
+        group=pieces.recording,
+        motion=_motion(model, pieces, smooth),
+        ahead=ahead,
+    )
+    return pieces, problem
 
 
 def _motion(model: CaseModel, windows: Windows, smooth: Windows) -> Motion:
@@ -207,10 +226,16 @@ def _motion(model: CaseModel, windows: Windows, smooth: Windows) -> Motion:
 
 def _scales(model: CaseModel, places: Sequence[str]) -> dict[str, Scales]:
     """How large things are at every place, over all recordings."""
-    qpos, qvel, ctrl = (np.concatenate([getattr(r, n) for r in model.recordings]) for n in ("qpos", "qvel", "ctrl"))
+    qpos, qvel, sensors, ctrl = (
+        np.concatenate([getattr(r, n) for r in model.recordings]) for n in ("qpos", "qvel", "sensors", "ctrl")
+    )
     duration = max(float(r.time[-1] - r.time[0]) for r in model.recordings)
-    m, dt = model.compiled, model.system.dt
-    return {place: recorded_scales(m, place, qpos, qvel, ctrl, dt, duration) for place in dict.fromkeys(places)}
+    places, dt = list(dict.fromkeys(places)), model.system.dt
+    plain: Any = model.system
+    if isinstance(model.system, Restarted):
+        return {place: commanded_scales(plain, place, sensors, ctrl, dt, duration) for place in places}
+    m = model.compiled
+    return {place: recorded_scales(m, place, qpos, qvel, ctrl, dt, duration) for place in places}
 
 
 def join(first: Windows, second: Windows) -> Windows:
@@ -288,7 +313,14 @@ def diagnose_case(
             "augmented": moments_of_theta(bench, result.confusion or [result.best], result.probabilities or [1.0]),
         },
         experiment=next_experiment(model, bench, result, shots),
+        absorbed=_absorbed(taken.problem, none),
     )
+
+
+def _absorbed(problem: Problem, none: Entry) -> list[str]:
+    """What the parameters can take the place of, where candidates are simulated and not held against a motion."""
+    scene = problem.every.scene if isinstance(problem.system, Restarted) and problem.pairs else None
+    return find_absorbed(scene, none.fit.z, none.fit.sigma) if isinstance(scene, SimulatedScene) else []
 
 
 def _floor(bench: Bench, entry: Entry, scale: np.ndarray, model: CaseModel, shots: Shots) -> float:
@@ -319,8 +351,8 @@ class _Residual:
 def _fit_residual_force(key: Array, taken: _Taken, none: Entry) -> _Residual | None:
     """A flexible force at all joints, what each joint alone explains, and the forces along the recordings."""
     model, problem = taken.model, taken.problem
-    joints = model.case.layout.single
-    if not joints:
+    joints, motion = model.case.layout.single, problem.motion
+    if not joints or motion is None:
         return None
     places = [f"joint/{name}" for name, _, _ in joints]
     scales = {p: problem.scales[p] for p in places}
@@ -338,7 +370,7 @@ def _fit_residual_force(key: Array, taken: _Taken, none: Entry) -> _Residual | N
         left.append(1.0 if alone is None else share_left(screen.misfit(key, alone), before))
     bench = problem.bench(pairs, slots)
     weights = np.asarray(jnp.stack([bench.each[0].value(z) for z in found.p[bench.d :]]))
-    motion, gears, forces = problem.motion, _gears(model), {}
+    gears, forces = _gears(model), {}
     rows = taken.pieces.valid
     time = (taken.pieces.start[:, None] + taken.pieces.time[:, :-1])[rows]
     for k, (place, (_, q, v)) in enumerate(zip(places, joints, strict=True)):
@@ -368,21 +400,28 @@ def _locations(taken: _Taken, result: Diagnosis, residual: _Residual | None) -> 
     every = np.maximum(result.baseline.misfit.excess, 0.0)
     names = [model.recordings[i].name for i in pieces.recording]
     when = find_windows_of(every.sum(1), names, pieces.start, float(pieces.time.max()))
-    if residual is None:
-        return _by_channel(model, every.sum(0), when)
     shares = _shares_of_effects(model, result)
+    if residual is None:
+        if not shares:
+            return _by_channel(model, every.sum(0), when)
+        return [Location(place, share, "everywhere", when) for place, share in _largest(shares)]
     if not all(_joint_of(model, place) in residual.forces for place in shares) or not shares:
         shares = dict(zip(residual.places, residual.shares.tolist(), strict=True))
-    ranked = sorted(shares.items(), key=lambda item: -item[1])
-    kept = [item for k, item in enumerate(ranked) if k == 0 or item[1] >= SMALLEST]
-    total = max(sum(share for _, share in kept), 1e-12)
     found = []
-    for place, share in kept:
+    for place, share in _largest(shares):
         joint = _joint_of(model, place)
         force, position, velocity, drive, time = residual.forces[joint]
         regime = find_regime(force, position, velocity, drive, time, result.bench.scales[joint])
-        found.append(Location(place, round(share / total, 4), regime, when))
+        found.append(Location(place, share, regime, when))
     return found
+
+
+def _largest(shares: dict[str, float]) -> list[tuple[str, float]]:
+    """Places and their shares, largest first, without the small ones; what is left sums to one."""
+    ranked = sorted(shares.items(), key=lambda item: -item[1])
+    kept = [item for k, item in enumerate(ranked) if k == 0 or item[1] >= SMALLEST]
+    total = max(sum(share for _, share in kept), 1e-12)
+    return [(place, round(share / total, 4)) for place, share in kept]
 
 
 def _shares_of_effects(model: CaseModel, result: Diagnosis) -> dict[str, float]:
@@ -416,6 +455,8 @@ def _by_channel(
 def _joint_of(model: CaseModel, place: str) -> str:
     """The joint at which an effect's place is felt; the place itself where there is none."""
     kind, _, rest = place.partition("/")
+    if isinstance(model.system, Restarted):
+        return place
     m = model.compiled
     if kind == "actuator":
         joint = int(m.actuator(rest).trnid[0])

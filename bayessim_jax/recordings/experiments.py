@@ -12,6 +12,7 @@ from jaxtyping import Float
 from bayessim_jax.diagnosis.bench import Bench
 from bayessim_jax.diagnosis.experiment import Experiment, Motions, commands, design
 from bayessim_jax.diagnosis.verdict import Diagnosis
+from bayessim_jax.inference.replay import Restarted
 from bayessim_jax.inference.shooting import Shots
 from bayessim_jax.recordings.files import write_text
 from bayessim_jax.recordings.shots import CaseModel
@@ -27,6 +28,10 @@ HINTS = {
     "feels it: from command and position of one joint alone the two delays cannot be told apart",
     frozenset({"actuator_bias", "sensor_offset"}): "the joint held at several known angles",
     frozenset({"viscous_friction", "back_emf"}): "motion with the motor off (open circuit)",
+    frozenset(
+        {"actuator_gain"}
+    ): "what one of the actuators gives for a known command: a weaker one beside another is a "
+    "stronger one beside that, with other parameters",
     frozenset({"actuator_gain", "armature"}): "a known load held still, and then fast motion",
 }
 """What to measure where no command of the library helps."""
@@ -42,11 +47,15 @@ def next_experiment(model: CaseModel, bench: Bench, result: Diagnosis, shots: Sh
 
 
 def _library(model: CaseModel) -> Motions:
-    """Commands from where a recording began, and releases at rest."""
+    """Commands from where a recording began, and releases at rest where there are joints."""
     dt, layout = model.system.dt, model.case.layout
     rows = round(float(np.clip(LENGTHS * model.case.case.horizon, LEAST, MOST)) / dt)
     recorded = np.concatenate([r.ctrl for r in model.recordings])
     first = model.recordings[0]
+    if isinstance(model.system, Restarted):
+        names, signals = zip(*commands(recorded, layout.ctrl, rows, dt), strict=True)
+        still = np.zeros((len(names), 0))
+        return Motions(list(names), np.stack(signals), np.tile(first.sensors[0], (len(names), 1)), still)
     qpos, qvel = (np.concatenate([getattr(r, n) for r in model.recordings]) for n in ("qpos", "qvel"))
     library, starts = [], []
     for name, signal in commands(recorded, layout.ctrl, rows, dt):

@@ -110,7 +110,9 @@ def start_spread(model: CaseModel, fit: Fit) -> Float[np.ndarray, " n"]:
     """How far recorded initial states are off: their own noise where they were measured, else what the fit found."""
     found = fit.usual_move
     if isinstance(model.system, Restarted):
-        return np.asarray(fit.sigma) if len(found) == len(model.channels) else found
+        size = model.system.observations.size
+        unrecorded = np.zeros(len(found) - size)  # commands that nobody recorded are no noise
+        return np.concatenate([fit.sigma, unrecorded]) if size == len(model.channels) else found
     joints, nv = model.case.layout.single, model.system.engine.model.nv
     sigma = dict(zip(model.channels, np.asarray(fit.sigma), strict=True))
     names = {v: (f"joint/{name}/qpos", f"joint/{name}/qvel") for name, _, v in joints}

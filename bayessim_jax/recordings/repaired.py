@@ -190,7 +190,7 @@ def load_repaired(path: Path) -> Repaired:
     """Read what `bayessim diagnose` left in a folder, and make its simulator of the case again.
 
     Raises `ValueError` where the folder is no such run, where it or its case is damaged, and where there is nothing to
-    train: no actuator, no slide or hinge, no parameter.
+    train: a registered system, no actuator, no slide or hinge, no parameter.
     """
     folder = RunFolder.open(path)
     config = folder.read_config()
@@ -199,13 +199,13 @@ def load_repaired(path: Path) -> Repaired:
         raise ValueError(f"{path} holds a run of bayessim {other}; give a folder that bayessim diagnose wrote.")
     table, state = (read_table(folder.path / name) for name in ("diagnosis.json", STATE))
     try:
+        case = load_case(Path(config["case"]), mask=True).check()
+        if case.model is None:
+            name = case.case.system
+            raise ValueError(f"{path} is of the registered system {name}; train on that: bayessim online {name}.")
         verdict = str(table["verdict"])
         which = "augmented" if verdict in ("explained", "ambiguous") else "baseline"
-        model = case_model(
-            load_case(Path(config["case"]), mask=True).check(),
-            engine=str(config["engine"]),
-            refined=int(state["refined"]),
-        )
+        model = case_model(case, engine=str(config["engine"]), refined=int(state["refined"]))
         simulator, mean = simulator_of(model, state, which)
         sds = [entry[which]["sd"] for entry in table["parameters"].values()]
         sds += [p["sd"] for effect in table["effects"] for p in effect["parameters"].values()]

@@ -77,7 +77,7 @@ def write_diagnosis(folder: RunFolder, diagnosis: CaseDiagnosis, seed: int) -> N
     _write_laplace(folder.path / "posterior.nc", diagnosis, seed)
     theta, _ = diagnosis.theta["augmented"]
     values = dict(zip(diagnosis.model.margins.names, theta.tolist(), strict=True))
-    if diagnosis.result.verdict != "unexplained":
+    if diagnosis.result.verdict != "unexplained" and diagnosis.model.case.model is not None:
         effects = _found(diagnosis) if diagnosis.result.confusion else []
         write_model(folder.path / "model_augmented.xml", diagnosis.model.case, values, effects)
 

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from bayessim_jax.beliefs.margins import Margin, Margins, log_normal, normal, uniform
+from bayessim_jax.contracts import Box
 from bayessim_jax.inference.replay import Inputs, Replay, Restarted
 from bayessim_jax.inference.scores import predict_windows
 from bayessim_jax.inference.shooting import Shots
@@ -141,17 +142,20 @@ class CaseModel:
         before = math.ceil(self.before / self.system.dt - 1e-9)
         shapes = (windows.ctrl, windows.qpos, windows.qvel)
         past, places, rates = (np.zeros((len(windows), before, x.shape[-1])) for x in shapes)
+        unrecorded = np.zeros((len(windows), before), bool)
         for w in range(len(windows)):
             recording = self.recordings[windows.recording[w]]
             row = int(np.argmin(np.abs(recording.time - windows.start[w])))
             if before:
                 rows, smooth = np.arange(row - before, row), self.smoothed.recordings[windows.recording[w]]
+                unrecorded[w] = rows < 0
                 early, rows = np.minimum(rows, 0) * self.system.dt, np.maximum(rows, 0)
                 past[w], rates[w] = recording.ctrl[rows], smooth.qvel[rows]
                 places[w] = _coast(self, smooth.qpos[rows], rates[w] * early[:, None])
         place = windows.sensors[:, 0] if isinstance(self.system, Restarted) else windows.qpos[:, 0]
         first = (place, windows.qvel[:, 0], windows.ctrl, past, windows.start)
-        return Inputs(*map(jnp.asarray, first), motion=(jnp.asarray(places), jnp.asarray(rates)))
+        motion = (jnp.asarray(places), jnp.asarray(rates))
+        return Inputs(*map(jnp.asarray, first), motion=motion, unrecorded=jnp.asarray(unrecorded))
 
     def _stack(self, qpos: np.ndarray, qvel: np.ndarray, sensors: np.ndarray) -> np.ndarray:
         layout = self.case.layout
@@ -160,9 +164,14 @@ class CaseModel:
         return every[..., [names.index(name) for name in self.channels]]
 
     def _spread(self) -> np.ndarray:
-        """How far initial states may be off: as far as the recordings move at all."""
+        """How far initial states may be off: as far as the recordings move at all.
+
+        Where commands before a window are kept, those before the recording may be off by as much as commands vary.
+        """
         if isinstance(self.system, Restarted):
-            return np.maximum(np.concatenate([r.sensors for r in self.recordings]).std(0), 1e-3)
+            names = ("sensors", "ctrl") if self.before else ("sensors",)
+            columns = [np.concatenate([getattr(r, name) for r in self.recordings]) for name in names]
+            return np.maximum(np.concatenate(columns, axis=1).std(0), 1e-3)
         nv = self.system.engine.model.nv
         qvel = np.concatenate([r.qvel for r in self.recordings])
         step = np.concatenate([_motions(self.system.engine.model, r.qpos) for r in self.recordings])
@@ -303,7 +312,8 @@ def _restarted(case: LoadedCase) -> Restarted:
         raise ValueError(f"system {case.case.system} cannot be restarted from recordings; give the model as MJCF.")
     box = system.parameters
     index = tuple(box.names.index(str(p.targets[0])) for p in case.parameters)
-    return Restarted(system, jnp.asarray((box.low + box.high) / 2, float), index)
+    parameters = Box.create(**{p.name: (*_bounds(p.prior), p.unit) for p in case.parameters})
+    return Restarted(system, parameters, jnp.asarray((box.low + box.high) / 2, float), index)
 
 
 def _bounds(prior: Prior) -> tuple[float, float]:

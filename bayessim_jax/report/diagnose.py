@@ -68,6 +68,7 @@ def render(diagnosis: CaseDiagnosis, facts: Mapping[str, Any]) -> str:
         f"<h1>{html.escape(case.case.name)}</h1>",
         f'<p class="lead">{html.escape(headline(diagnosis))}</p>',
         *notices,
+        _absorbed(diagnosis),
         html.section("Recording against prediction", _traces(diagnosis), _scores(diagnosis)),
     ]
     if diagnosis.locations:
@@ -95,6 +96,16 @@ def render(diagnosis: CaseDiagnosis, facts: Mapping[str, Any]) -> str:
     ]
     title = f"{case.case.name}: {result.verdict}"
     return html.page(title, "\n".join(body), script=script(), script_hash=SCRIPT_HASH)
+
+
+def _absorbed(diagnosis: CaseDiagnosis) -> str:
+    """What is not there to be found; empty where nothing is known to be."""
+    names = diagnosis.table()["absorbed"]
+    if not names:
+        return ""
+    unknowns = ", ".join(diagnosis.model.margins.names)
+    text = f"Not there to be found, because other values of {unknowns} would do the same: {', '.join(names)}."
+    return f"<p>{html.escape(text)}</p>"
 
 
 def _series(diagnosis: CaseDiagnosis) -> list[dict[str, Any]]:
@@ -161,7 +172,7 @@ def _entries(diagnosis: CaseDiagnosis) -> str:
     for entry in diagnosis.result.entries:
         named = "yes" if entry in diagnosis.result.confusion else ""
         left = share_left(entry.misfit, base.misfit)
-        shares = (f"{100 * share:.2g} %" for share in (left, entry.ahead))
+        shares = (f"{number(100 * share, 2)} %" for share in (left, entry.ahead))
         rows.append([" + ".join(entry.names), number(entry.score - base.score, 4), *shares, named])
     return html.table(["finalist", "gain on recordings left out", "misfit left", "error ahead left", "named"], rows)
 

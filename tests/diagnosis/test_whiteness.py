@@ -38,6 +38,20 @@ def test_residuals_of_a_constant_size_are_no_noise():
     assert p_values[0] > 0.05 > 0.01 > p_values[1]
 
 
+def test_what_moves_no_prediction_absorbs_nothing():
+    """Commands from before a recording, of a simulator in which nothing remembers them."""
+    rng, (windows, rows) = np.random.default_rng(3), (5, 30)
+    moves = np.linspace(-1, 1, rows)[None, None].repeat(windows, 0)
+    still, measured = np.zeros_like(moves), np.ones((windows, rows, 1), bool)
+    noise = rng.standard_normal((windows, rows, 1))
+    alone, beside = (
+        judge_misfit(jax.random.key(0), noise, jax.numpy.asarray(slopes), measured)
+        for slopes in (moves, np.concatenate([moves, still, moves], axis=1))
+    )
+    assert alone.p_value == beside.p_value
+    np.testing.assert_allclose(alone.excess, beside.excess, rtol=1e-4)
+
+
 def test_windows_that_do_not_count_are_no_evidence_before_or_after():
     """An effect that remembers is off where its past is unknown: these windows are left out on both sides."""
     rng, (windows, rows) = np.random.default_rng(2), (20, 40)

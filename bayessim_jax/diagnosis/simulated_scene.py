@@ -1,0 +1,94 @@
+"""A bench in the place of a scene: systems without a model have no motion to linearize, and are simulated at once.
+
+A registered system takes few effects and its simulation costs little, so that what `diagnosis.screen` does along the
+recorded motion is done here by simulating.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from bayessim_jax.beliefs.margins import Margin
+from bayessim_jax.diagnosis.bench import Bench, Candidate
+from bayessim_jax.effects.commanded import EVERY
+from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Curvature, Shots, expand, normal_equations
+
+__all__ = ["SimulatedScene"]
+
+
+class SimulatedScene:
+    """The pairs and windows of a bench, with normal equations at single points."""
+
+    def __init__(self, bench: Bench) -> None:
+        self.bench = bench
+        self.shots, self.pairs, self.d, self.slots = bench.shots, bench.pairs, bench.d, bench.slots
+        own = [bench.columns(Candidate((k,))) for k in range(len(bench.pairs))]
+        self.parameters = [[bench.parameters[i] for i in columns] for columns in own]
+        self.margin: list[list[Margin]] = [[bench.each[i] for i in columns] for columns in own]
+        self.sites = [w.site for w in bench.wired]
+        self._shots: dict[Candidate, Shots] = {}
+
+    def twin(self) -> SimulatedScene:
+        """The same for another thread."""
+        return SimulatedScene(self.bench)
+
+    def count(self, candidate: Candidate) -> int:
+        """Parameters of a candidate."""
+        return len(self.bench.columns(candidate))
+
+    def name(self, candidate: Candidate) -> str:
+        """`actuator_lag@actuator/left + …`."""
+        return " + ".join(self.bench.names(candidate)) or "nothing"
+
+    def takes(self, candidate: Candidate) -> bool:
+        """Whether it can be tried: not an effect of all actuators and of one, nor with too many parameters."""
+        alike = {self.pairs[k][0].name for k in candidate.effects if self.pairs[k][1] == EVERY}
+        apart = {self.pairs[k][0].name for k in candidate.effects if self.pairs[k][1] != EVERY}
+        return not alike & apart and self.count(candidate) <= self.slots
+
+    def apart(self, candidate: Candidate) -> list[tuple[Candidate, tuple[int, ...]]]:
+        """A candidate with an effect of all actuators on each of them instead, and which of its effects it keeps."""
+        found = []
+        for k in candidate.effects:
+            effect, place = self.pairs[k]
+            if place == EVERY:
+                each = (i for i, (other, where) in enumerate(self.pairs) if other is effect and where != EVERY)
+                kept = tuple(i for i in candidate.effects if i != k)
+                found.append((Candidate(kept) + Candidate(tuple(each)), kept))
+        return found
+
+    def offsets(self, candidate: Candidate) -> list[tuple[int, slice]]:
+        """Every effect of a candidate and the places of its parameters in p = [θ's z, x, zeros]."""
+        found, first = [], self.d
+        for k in candidate.effects:
+            found.append((k, slice(first, first + len(self.parameters[k]))))
+            first = found[-1][1].stop
+        return found
+
+    def assess(
+        self, candidate: Candidate, p: Float[np.ndarray, " k"], delta: Float[Array, "windows n"], sigma: Array
+    ) -> tuple[Curvature, Float[Array, "windows rows obs"], Float[Array, "windows kn rowsobs"]]:
+        """Normal equations at a point, residuals over σ, and derivatives of what is predicted over σ."""
+        if candidate not in self._shots:
+            self._shots[candidate] = self.bench.setup(candidate)
+        return _assess(self.bench.predict, self._shots[candidate], jnp.asarray(p), delta, sigma)
+
+    def states(self, delta: Float[Array, "windows n"]) -> list[Float[Array, "windows n"]]:
+        """Initial states to begin from: those of a fit, and the recorded ones, which no misfit has moved."""
+        return [delta, jnp.zeros_like(delta)]
+
+    def begin_around(self, p: Float[Array, " k"]) -> None:
+        """Nothing is kept from fit to fit."""
+
+
+def _assess_impl(predict: Any, shots: Shots, p: Array, delta: Array, sigma: Array) -> tuple[Curvature, Array, Array]:
+    r, slopes = expand(predict, shots, p, delta, sigma)
+    return normal_equations(r, slopes, p, delta / shots.spread), r.reshape(shots.y.shape), slopes
+
+
+_assess = jax.jit(_assess_impl, static_argnames="predict", compiler_options=COMPILER_OPTIONS)
