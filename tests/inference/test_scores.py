@@ -1,10 +1,14 @@
 """Scores of predictions, against their closed forms."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from bayessim_jax.beliefs.margins import Margins, normal, uniform
 from bayessim_jax.inference.identifiability import find_unidentified
-from bayessim_jax.inference.scores import compare, error_spread, score
+from bayessim_jax.inference.replay import Replay
+from bayessim_jax.inference.scores import CHUNK, compare, error_spread, predict_windows, score
+from bayessim_jax.inference.shooting import Shots
 
 
 def errors(sd, seed=0, windows=40, rows=33):
@@ -56,3 +60,30 @@ def test_identifiability_names_what_is_not_informed_ridges_and_edges():
     assert [r[:2] for r in found.ridges] == [("a", "b")]
     assert found.at_edge == ["pushed"]
     assert found.contraction["known"] == pytest.approx(0.99, abs=0.01)
+
+
+@pytest.mark.parametrize("windows", [0, 1, CHUNK, CHUNK + 7])
+def test_windows_are_predicted_as_by_themselves_however_many_there_are(windows):
+    """y_t = z (x + δ) + t, one window after the other, through one program."""
+    traced = []
+
+    def predict(z, delta, start):
+        traced.append(start.shape)
+        return (z[0] * (start + delta[0]) + jnp.arange(5.0))[:, None]
+
+    rng = np.random.default_rng(0)
+    starts, moved, y = rng.normal(size=windows), rng.normal(size=(windows, 1)), np.zeros((windows, 5, 1))
+    shots = Shots(jnp.asarray(starts), jnp.asarray(y), jnp.ones(y.shape, bool), jnp.ones(1))
+    for delta, start in ((None, starts), (moved, starts + moved[:, 0])):
+        found = predict_windows(predict, shots, np.array([2.0]), delta)
+        np.testing.assert_allclose(found[..., 0], 2.0 * start[:, None] + np.arange(5.0), rtol=1e-6, atol=1e-6)
+    assert len(traced) == (1 if windows else 0)
+
+
+def test_what_was_compiled_for_a_system_and_its_priors_serves_them_again():
+    system, other = object(), object()
+    margins = Margins.create(["a"], [uniform(0.0, 1.0)])
+    assert Replay(system, margins) == Replay(system, Margins.create(["a"], [uniform(0.0, 1.0)]))
+    assert hash(Replay(system, margins)) == hash(Replay(system, Margins.create(["a"], [uniform(0.0, 1.0)])))
+    assert Replay(system, margins) != Replay(other, margins)
+    assert Replay(system, margins) != Replay(system, Margins.create(["a"], [normal(0.0, 1.0)]))
