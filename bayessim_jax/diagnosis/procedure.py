@@ -121,8 +121,6 @@ class Problem:
     step: float = 0.0
     ahead: Shots | None = None
     """Windows as long as predictions are to be, to which nothing is fitted."""
-    start: Callable[[Fit], Float[np.ndarray, " n"]] = lambda fit: fit.usual_move
-    """How far recorded initial states are off, of a fit with the sensors' noise."""
 
     @cached_property
     def every(self) -> Screen:
@@ -193,7 +191,7 @@ def name_effects(
     singles = _finalists(screen, nothing, ranked)
     work = _bench_of(key, problem, singles, say)
     none = _without(work, problem, detected)
-    entries = _finish(work, none, singles, problem, thresholds)
+    entries = _finish(work, none, singles, problem.ahead, thresholds)
     left = share_left(entries[0].misfit, none.misfit) if entries else 1.0
     explained = bool(entries) and explains(entries[0], none, thresholds)
     # where nothing is predicted ahead, what shows in the windows themselves is all that tells of another effect
@@ -210,7 +208,7 @@ def name_effects(
             best = {work.numbers[k] for entry in entries[:2] for k in entry.candidate.effects}
             kept = [*pairs, *(found for found in ranked if found.candidate.effects[0] in alone | best)]
             work = _bench_of(key, problem, kept, say)
-            entries = _finish(work, none, kept, problem, thresholds)
+            entries = _finish(work, none, kept, problem.ahead, thresholds)
             while entries and _is_too_narrow(entries, none, thresholds):
                 leads = [_settled(screen, work, entry, kept) for entry in _widest(work.bench, none, entries)]
                 grown = [(found, known) for known in leads for found in growth.extend(known)]
@@ -221,7 +219,7 @@ def name_effects(
                 wider = sorted(wider, key=lambda found: -found.score)[:PAIRS]
                 kept = [*wider, *kept]
                 work = _bench_of(key, problem, kept, say)
-                entries = _finish(work, none, kept, problem, thresholds)
+                entries = _finish(work, none, kept, problem.ahead, thresholds)
     return decide(work.bench, none, entries, work.group, thresholds, listed)
 
 
@@ -439,7 +437,7 @@ def _with_numbers_of(bench: Bench, best: Entry, other: Entry) -> Float[Array, " 
 
 
 def _finish(
-    work: _Work, none: Entry, candidates: Sequence[Screened], problem: Problem, thresholds: Thresholds
+    work: _Work, none: Entry, candidates: Sequence[Screened], ahead: Shots | None, thresholds: Thresholds
 ) -> list[Entry]:
     """Candidates simulated and fitted from where the screen found them, and scored across recordings, best first.
 
@@ -484,22 +482,19 @@ def _finish(
         best = entries[0] if entries else none
         rivals = [entry for entry in entries if _are_rivals(entry, best, none, thresholds)][:AGAIN]
         _replace(work, entries, zip(rivals, pool.map(partial(from_numbers_of, best), rivals), strict=True))
-    if problem.ahead is not None and entries:
-        _look_ahead(bench, none, entries, problem.ahead, problem.start)
+    if ahead is not None and entries:
+        _look_ahead(bench, none, entries, ahead)
     return entries
 
 
-def _look_ahead(
-    bench: Bench, none: Entry, entries: Sequence[Entry], ahead: Shots, start: Callable[[Fit], Float[np.ndarray, " n"]]
-) -> None:
+def _look_ahead(bench: Bench, none: Entry, entries: Sequence[Entry], ahead: Shots) -> None:
     """How far every candidate predicts long windows better than the simulator without effects.
 
-    Initial states are off by their own noise where they were measured, else by what the fit of the best moved them.
+    Initial states are off by what the best candidate's fit moved them.
     """
     base, best = bench.replay(Candidate(), none.fit.z, ahead), entries[0]
     predicted = [bench.replay(entry.candidate, entry.fit.z, ahead) for entry in entries]
-    off = start(dataclasses.replace(best.fit, sigma=jnp.asarray(best.misfit.noise)))
-    spread = np.nan_to_num(bench.scatter(best.candidate, best.fit.z, ahead, off, predicted[0]))
+    spread = np.nan_to_num(bench.scatter(best.candidate, best.fit.z, ahead, best.fit.usual_move, predicted[0]))
     for entry, here in zip(entries, predicted, strict=True):
         entry.ahead = error_left(ahead, here, base, entry.misfit.noise, spread)
 

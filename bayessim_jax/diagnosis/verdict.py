@@ -200,9 +200,11 @@ def decide(
 def explains(entry: Entry, none: Entry, thresholds: Thresholds) -> bool:
     """In the residuals of pieces of windows, or, where the sensors' own errors are what is left there, ahead.
 
-    What explains pieces and predicts hardly better than without it has found a small thing beside a larger one.
+    What explains pieces and predicts hardly better than without it has found a small thing beside a larger one. What is
+    not judged where its past is unknown is excused there already, and has to explain the pieces that are judged.
     """
-    if entry.misfit.p_value >= FALSE_ALARMS or entry.ahead <= thresholds.foreseen:
+    foreseen = entry.ahead <= thresholds.foreseen and bool(entry.misfit.judged.all())
+    if entry.misfit.p_value >= FALSE_ALARMS or foreseen:
         return True
     left = share_left(entry.misfit, none.misfit)
     return left <= thresholds.left and not (entry.ahead > thresholds.ahead or left * entry.ahead > thresholds.both)

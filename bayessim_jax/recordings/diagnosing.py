@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import jax
@@ -195,7 +194,6 @@ def _take_case(key: Array, model: CaseModel, effects: Sequence[Any], say: Callab
         group=fitted.recording,
         motion=None,
         step=model.step,
-        start=partial(start_spread, model),
     )
     pieces, problem = (fitted, whole) if isinstance(system, Restarted) else _cut(model, whole, fitted, len(windows))
     return _Taken(model, windows, np.arange(len(windows)) < len(fitted), pieces, whole, problem, settled)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bayessim_jax.diagnosis.bench import Candidate
-from bayessim_jax.diagnosis.procedure import _is_too_narrow, _look_ahead
+from bayessim_jax.diagnosis.procedure import _is_too_narrow
 from bayessim_jax.diagnosis.verdict import Entry, Thresholds, are_kin, decide, error_left
 from bayessim_jax.diagnosis.whiteness import Misfit
 from bayessim_jax.inference.shooting import Shots
@@ -86,6 +86,16 @@ def test_what_explains_pieces_and_predicts_no_better_explains_nothing():
         assert verdict(rough).verdict == wanted
 
 
+def test_what_is_excused_where_its_past_is_unknown_has_to_explain_what_is_judged():
+    """A jolt, taken for bristles: they leave a third of the misfit in pieces, and the moves of initial states hide it."""
+    for left, wanted in ((0.3, "unexplained"), (0.002, "explained")):
+        bristles = entry(["lugre_friction@x"], 100.0, left)
+        bristles.ahead = 0.0
+        judged = np.arange(WINDOWS) > 5
+        bristles.misfit = dataclasses.replace(bristles.misfit, judged=judged)
+        assert verdict(bristles).verdict == wanted
+
+
 def test_what_noise_in_initial_states_costs_ahead_is_no_error_of_a_candidate():
     rng, shape = np.random.default_rng(0), (40, 50, 2)
     noise, started = np.array([0.1, 0.2]), rng.normal(size=(40, 1, 1)) * np.linspace(0.0, 1.0, 50)[:, None]
@@ -97,34 +107,6 @@ def test_what_noise_in_initial_states_costs_ahead_is_no_error_of_a_candidate():
     assert error_left(shots, right, base, noise, spread) < 0.01
     assert error_left(shots, base, base, noise, spread) == pytest.approx(1.0)
     assert np.isnan(error_left(shots, right, right, noise, spread))
-
-
-def test_initial_states_that_were_measured_are_off_by_their_noise_and_not_by_what_a_fit_moved_them():
-    """A jolt moves the states of short windows: that must not excuse what is wrong half a second ahead."""
-    rng = np.random.default_rng(0)
-    y = 0.1 * rng.normal(size=(WINDOWS, 50, 1))
-
-    class Bench:
-        def replay(self, candidate, z, shots):
-            return y * 0.0 + (5.0 if not candidate.effects else 1.0)
-
-        def scatter(self, candidate, z, shots, start, here):
-            return np.full(here.shape, start[0] ** 2)
-
-    @dataclasses.dataclass
-    class Moved:
-        z: object = None
-        sigma: object = None
-        usual_move: object = dataclasses.field(default_factory=lambda: np.array([1.0]))
-
-    ahead = Shots(None, y, np.ones(y.shape, bool), np.ones(1))
-    for start, low, high in ((lambda fit: fit.usual_move, 0.0, 1e-3), (lambda fit: np.asarray(fit.sigma), 0.02, 0.06)):
-        none, found = entry([], 0.0, 1.0), entry(["a@x"], 100.0, 0.1)
-        for each in (none, found):
-            each.fit = Moved()
-            each.misfit = dataclasses.replace(each.misfit, noise=np.array([0.1]))
-        _look_ahead(Bench(), none, [found], ahead, start)
-        assert low <= found.ahead <= high
 
 
 def test_a_tie_with_what_does_not_explain_is_no_confusion():
