@@ -87,7 +87,7 @@ def test_what_explains_pieces_and_predicts_no_better_explains_nothing():
 
 
 def test_what_is_excused_where_its_past_is_unknown_has_to_explain_what_is_judged():
-    """A jolt, taken for bristles: they leave a third of the misfit in pieces, and the moves of initial states hide it."""
+    """A jolt, taken for bristles: they leave a third of the misfit in pieces; the moves of initial states hide it."""
     for left, wanted in ((0.3, "unexplained"), (0.002, "explained")):
         bristles = entry(["lugre_friction@x"], 100.0, left)
         bristles.ahead = 0.0
