@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from bayessim_jax.diagnosis.bench import NEAR, Candidate, begin_value
+from bayessim_jax.diagnosis.bench import NEAR, Candidate, begin_point
 from bayessim_jax.diagnosis.simulated_scene import SimulatedScene
 
 __all__ = ["find_absorbed"]
@@ -25,10 +25,7 @@ def find_absorbed(scene: SimulatedScene, z: Float[Array, " d"], sigma: Array) ->
     found = []
     for k in range(len(scene.pairs)):
         candidate = Candidate((k,))
-        own = [
-            float(m.standard(jnp.asarray(begin_value(p, NEAR), float)))
-            for p, m in zip(scene.parameters[k], scene.margin[k], strict=True)
-        ]
+        own = begin_point(scene.parameters[k], scene.margin[k], NEAR)
         point = np.zeros(scene.d + scene.slots)
         point[: scene.d], point[scene.d : scene.d + len(own)] = z[: scene.d], own
         _, _, slopes = scene.assess(candidate, point, still, sigma)

@@ -26,7 +26,7 @@ from bayessim_jax.inference.replay import Inputs, Restarted, replay_window
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Fit, Shots, solve
 from bayessim_jax.systems.mjcf import MjcfSystem
 
-__all__ = ["NEAR", "SLOTS", "Bench", "Candidate", "begin_value", "margin_of_effect"]
+__all__ = ["NEAR", "SLOTS", "Bench", "Candidate", "CandidatesOf", "begin_point", "begin_value", "margin_of_effect"]
 
 NEAR = 0.1
 """Of the way from an effect's neutral value to where a fit usually begins: weak effects are found from there."""
@@ -42,6 +42,33 @@ class Candidate:
 
     def __add__(self, other: Candidate) -> Candidate:
         return Candidate(tuple(sorted({*self.effects, *other.effects})))
+
+
+class CandidatesOf:
+    """Effects at places, numbered, and where a candidate's parameters stand among the numbers of a fit."""
+
+    pairs: Sequence[tuple[Any, str]]
+    parameters: Sequence[Sequence[EffectParameter]]
+    """Of every pair."""
+    d: int
+    """Parameters of the system."""
+    slots: int
+
+    def count(self, candidate: Candidate) -> int:
+        """Parameters of a candidate."""
+        return sum(len(self.parameters[k]) for k in candidate.effects)
+
+    def name(self, candidate: Candidate) -> str:
+        """`coulomb_friction@joint/hinge + …`."""
+        return " + ".join(f"{self.pairs[k][0].name}@{at(self.pairs[k][1])}" for k in candidate.effects) or "nothing"
+
+    def offsets(self, candidate: Candidate) -> list[tuple[int, slice]]:
+        """Every effect of a candidate and the places of its parameters in p = [θ's z, x, zeros]."""
+        found, first = [], self.d
+        for k in candidate.effects:
+            found.append((k, slice(first, first + len(self.parameters[k]))))
+            first += len(self.parameters[k])
+        return found
 
 
 @struct.dataclass
@@ -141,12 +168,7 @@ class Bench:
         """Points to begin from: θ as given, the effects a little off neutral, at their start values, and mirrored."""
         columns = self.columns(candidate)
         own = [self.parameters[i] for i in columns]
-
-        def standard(values: Sequence[float]) -> np.ndarray:
-            pairs = zip(columns, values, strict=True)
-            return np.array([float(self.each[i].standard(jnp.asarray(v, float))) for i, v in pairs])
-
-        begin, near = (standard([begin_value(p, share) for p in own]) for share in (1.0, NEAR))
+        begin, near = (begin_point(own, [self.each[i] for i in columns], share) for share in (1.0, NEAR))
         points = [near, begin] if len(own) and np.abs(near - begin).max() > 1e-9 else [begin]
         points += [-begin] if any(p.low < 0.0 for p in own) else []
         rest = np.zeros(self.slots - len(columns))
@@ -217,6 +239,14 @@ class Bench:
 def margin_of_effect(p: EffectParameter) -> Margin:
     """The prior of an effect's parameter."""
     return log_uniform(p.low, p.high) if p.log else uniform(p.low, p.high)
+
+
+def begin_point(
+    parameters: Sequence[EffectParameter], margins: Sequence[Margin], share: float = 1.0
+) -> Float[np.ndarray, " e"]:
+    """The z of `begin_value` of every parameter."""
+    pairs = zip(parameters, margins, strict=True)
+    return np.array([float(m.standard(jnp.asarray(begin_value(p, share), float))) for p, m in pairs])
 
 
 def begin_value(p: EffectParameter, share: float = 1.0) -> float:

@@ -175,9 +175,8 @@ def name_effects(
     """Find what a simulator lacks whose misfit was detected.
 
     First every effect at every place along the recorded motion (`diagnosis.screen`), or, in a system without a model,
-    simulated from few points; then the best of them are
-    simulated on a bench of their own, pairs where one is not enough, and larger sets where the best pair is worth both
-    of its effects and is not enough either.
+    simulated from few points; then the best of them are simulated on a bench of their own, pairs where one is not
+    enough, and larger sets where the best pair is worth both of its effects and is not enough either.
     """
     thresholds = thresholds or Thresholds()
     screen, start = problem.every, detected.fit

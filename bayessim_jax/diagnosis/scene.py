@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from bayessim_jax.beliefs.margins import Margin, Margins
-from bayessim_jax.diagnosis.bench import SLOTS, Candidate, margin_of_effect
+from bayessim_jax.diagnosis.bench import SLOTS, Candidate, CandidatesOf, margin_of_effect
 from bayessim_jax.diagnosis.forcing import Joint, commands_of, force_of, restore_readings
 from bayessim_jax.diagnosis.response import Forcing, Linearized, Motion, Windowed, assess, linearize_steps
 from bayessim_jax.effects import Scales, at, with_effects
@@ -53,7 +53,7 @@ class _Around:
     kept: dict[Any, Any] = field(default_factory=dict)
 
 
-class Scene:
+class Scene(CandidatesOf):
     """Pairs of effects and places, and windows of recordings with their smoothed motion."""
 
     def __init__(
@@ -68,7 +68,7 @@ class Scene:
         slots: int = SLOTS,
     ) -> None:
         self.system, self.margins, self.pairs, self.step, self.slots = system, margins, tuple(pairs), step, slots
-        self.motion, self.shots = motion, shots
+        self.motion, self.shots, self.d = motion, shots, margins.size
         self.parameters = [effect.parameters(place, scales[place]) for effect, place in self.pairs]
         self.margin: list[list[Margin]] = [[margin_of_effect(p) for p in each] for each in self.parameters]
         self.kinds = [
@@ -99,19 +99,6 @@ class Scene:
         twin._around, twin._home, twin._kept = {}, None, {}
         return twin
 
-    @property
-    def d(self) -> int:
-        """Parameters of the system."""
-        return self.margins.size
-
-    def count(self, candidate: Candidate) -> int:
-        """Parameters of a candidate."""
-        return sum(len(self.parameters[k]) for k in candidate.effects)
-
-    def name(self, candidate: Candidate) -> str:
-        """`coulomb_friction@joint/hinge + …`."""
-        return " + ".join(f"{self.pairs[k][0].name}@{at(self.pairs[k][1])}" for k in candidate.effects) or "nothing"
-
     def takes(self, candidate: Candidate) -> bool:
         """Whether it can be tried here: not at something else than a joint, nor with too many parameters."""
         placed = (self.pairs[k][0].port == "model" or self.sites[k].joint >= 0 for k in candidate.effects)
@@ -120,14 +107,6 @@ class Scene:
     def apart(self, candidate: Candidate) -> list[tuple[Candidate, tuple[int, ...]]]:
         """What stands for an effect of several actuators with one for each: nothing, for each has its own here."""
         return []
-
-    def offsets(self, candidate: Candidate) -> list[tuple[int, slice]]:
-        """Every effect of a candidate and the places of its parameters in p = [θ's z, x, zeros]."""
-        found, first = [], self.d
-        for k in candidate.effects:
-            found.append((k, slice(first, first + len(self.parameters[k]))))
-            first += len(self.parameters[k])
-        return found
 
     def assess(
         self, candidate: Candidate, p: Float[np.ndarray, " k"], delta: Float[Array, "windows n"], sigma: Array

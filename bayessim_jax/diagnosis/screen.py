@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 from scipy.stats import norm
 
-from bayessim_jax.diagnosis.bench import NEAR, Candidate, begin_value
+from bayessim_jax.diagnosis.bench import NEAR, Candidate, begin_point
 from bayessim_jax.diagnosis.response import propose
 from bayessim_jax.diagnosis.scene import Scene
 from bayessim_jax.diagnosis.simulated_scene import SimulatedScene
@@ -92,7 +92,7 @@ class Screen:
         random = np.random.default_rng(candidate.effects)
         parameters, margin = self.scene.parameters, self.scene.margin
         each = [(p, m) for k in candidate.effects for p, m in zip(parameters[k], margin[k], strict=True)]
-        begin = np.array([float(m.standard(jnp.asarray(p.start, float))) for p, m in each])
+        begin = self._begin(candidate)
         points = [begin]
         signs = np.array([-1.0 if p.low < 0.0 else 1.0 for p, _ in each])
         if (signs < 0.0).any():
@@ -249,17 +249,17 @@ class Screen:
         """
         self.scene.begin_around(known.p)
         added = Candidate(tuple(k for k in candidate.effects if k not in known.candidate.effects))
-        each = [q for k in added.effects for q in zip(self.scene.parameters[k], self.scene.margin[k], strict=True)]
-        starts = [
-            np.array([float(m.standard(jnp.asarray(begin_value(p, share), float))) for p, m in each])
-            for share in (NEAR, 1.0)
-        ]
         costs = []
-        for start in [*starts, *([alone] if alone is not None else [])]:
+        for start in [self._begin(added, NEAR), self._begin(added), *([alone] if alone is not None else [])]:
             p = self._put(added, known, start)
             found = self.fit(candidate, p, known.delta, known.sigma, GLANCING)
             costs.append(np.inf if found[2] is None else float(found[2].cost))
         return min(costs)
+
+    def _begin(self, candidate: Candidate, share: float = 1.0) -> Float[np.ndarray, " e"]:
+        """A candidate's x where a fit begins."""
+        parameters = [p for k in candidate.effects for p in self.scene.parameters[k]]
+        return begin_point(parameters, [m for k in candidate.effects for m in self.scene.margin[k]], share)
 
     def _put(self, added: Candidate, known: Screened, start: Float[np.ndarray, " e"]) -> Float[np.ndarray, " k"]:
         """The p of what is known with effects added to it, which begin at `start`."""

@@ -14,14 +14,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from bayessim_jax.beliefs.margins import Margin
-from bayessim_jax.diagnosis.bench import Bench, Candidate
+from bayessim_jax.diagnosis.bench import Bench, Candidate, CandidatesOf
 from bayessim_jax.effects.commanded import EVERY
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Curvature, Shots, expand, normal_equations
 
 __all__ = ["SimulatedScene"]
 
 
-class SimulatedScene:
+class SimulatedScene(CandidatesOf):
     """The pairs and windows of a bench, with normal equations at single points."""
 
     def __init__(self, bench: Bench) -> None:
@@ -36,14 +36,6 @@ class SimulatedScene:
     def twin(self) -> SimulatedScene:
         """The same for another thread."""
         return SimulatedScene(self.bench)
-
-    def count(self, candidate: Candidate) -> int:
-        """Parameters of a candidate."""
-        return len(self.bench.columns(candidate))
-
-    def name(self, candidate: Candidate) -> str:
-        """`actuator_lag@actuator/left + …`."""
-        return " + ".join(self.bench.names(candidate)) or "nothing"
 
     def takes(self, candidate: Candidate) -> bool:
         """Whether it can be tried: not an effect of all actuators and of one, nor with too many parameters."""
@@ -60,14 +52,6 @@ class SimulatedScene:
                 each = (i for i, (other, where) in enumerate(self.pairs) if other is effect and where != EVERY)
                 kept = tuple(i for i in candidate.effects if i != k)
                 found.append((Candidate(kept) + Candidate(tuple(each)), kept))
-        return found
-
-    def offsets(self, candidate: Candidate) -> list[tuple[int, slice]]:
-        """Every effect of a candidate and the places of its parameters in p = [θ's z, x, zeros]."""
-        found, first = [], self.d
-        for k in candidate.effects:
-            found.append((k, slice(first, first + len(self.parameters[k]))))
-            first = found[-1][1].stop
         return found
 
     def assess(

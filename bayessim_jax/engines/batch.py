@@ -11,16 +11,16 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
-__all__ = ["CPU_OPTIONS", "compile_batched", "compile_spread", "forward_jacobians"]
+__all__ = ["CPU_OPTIONS", "TASKS", "WIDE", "compile_batched", "compile_spread", "forward_jacobians"]
 
-CPU_OPTIONS = {
-    "xla_disable_hlo_passes": "cpu-parallel-task-assigner,cse_barrier_expander",
-    "xla_cpu_prefer_vector_width": "512",
-}
+TASKS = "cpu-parallel-task-assigner"
+"""The pass of XLA that hands every operation of a time step to a pool of threads, which costs many times the operation
+from some hundred simulations on."""
+WIDE = {"xla_cpu_prefer_vector_width": "512"}
+CPU_OPTIONS = {"xla_disable_hlo_passes": f"{TASKS},cse_barrier_expander", **WIDE}
 """No splitting of each small loop over threads, barriers that hold until code is made, and wide vectors.
 
-The two passes: without the first, every operation of a step is handed to a pool of threads; the second would let the
-compiler repeat a step's equations for every joint.
+The second pass would let the compiler repeat a step's equations for every joint.
 """
 
 

@@ -26,6 +26,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from bayessim_jax.contracts import Scalar
+from bayessim_jax.engines.batch import TASKS, WIDE
 
 __all__ = [
     "COMPILER_OPTIONS",
@@ -202,13 +203,9 @@ def eliminate(c: Curvature, damping: Scalar | float = 0.0) -> tuple[Array, Array
 TOLERANCE, ROUGH, DAMPING = 1e-7, 1e-4, 1e-3
 """Of the solver: the share of the cost that it ends with, by derivatives and by differences, and the damping that it
 begins with."""
-COMPILER_OPTIONS = {
-    "xla_cpu_use_fusion_emitters": False,
-    "xla_disable_hlo_passes": "cpu-parallel-task-assigner",
-    "xla_cpu_prefer_vector_width": "512",
-}
+COMPILER_OPTIONS = {"xla_cpu_use_fusion_emitters": False, "xla_disable_hlo_passes": TASKS, **WIDE}
 """For programs of small arrays on a CPU: compilation takes half as long, vectors are wide, and no operation of a time
-step is cut up for a pool of threads, which costs many times the operation from some hundred simulations on."""
+step is cut up for a pool of threads."""
 
 
 @partial(jax.jit, static_argnames=("predict", "step"), compiler_options=COMPILER_OPTIONS)
