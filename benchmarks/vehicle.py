@@ -1,8 +1,17 @@
 """Cases of a skid-steered vehicle, driven here in NumPy: wheels that are late, and ground on which they slip."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+__all__ = ["THETA", "Vehicle", "drive", "write_case"]
 
 DT, FINE = 0.05, 40
 BEFORE = 60
@@ -28,7 +37,7 @@ class Vehicle:
     """By how much that changes, up and down with a period of 1.7 s."""
 
 
-def commands(rng, rows):
+def _commands(rng: np.random.Generator, rows: int) -> np.ndarray:
     """Steps that last half a second to one and a half, rad/s."""
     signal, row = np.zeros((rows, 2)), 0
     while row < rows:
@@ -38,9 +47,9 @@ def commands(rng, rows):
     return signal
 
 
-def drive(vehicle, rng, rows, noise):
+def drive(vehicle: Vehicle, rng: np.random.Generator, rows: int, noise: float) -> np.ndarray:
     """Columns of a recording: time, pose with noise, commands."""
-    signal, (radius, distance, icr), h = commands(rng, BEFORE + rows), THETA, DT / FINE
+    signal, (radius, distance, icr), h = _commands(rng, BEFORE + rows), THETA, DT / FINE
     flat, late = np.repeat(signal, FINE, axis=0), round(vehicle.delay / h)
     decay = np.array([np.exp(-h / lag) if lag else 0.0 for lag in vehicle.lag])
     wheels, pose, poses = signal[0], np.zeros(3), []
@@ -62,7 +71,15 @@ def drive(vehicle, rng, rows, noise):
     return np.column_stack([DT * np.arange(rows), seen, signal[BEFORE:]])
 
 
-def write_case(folder, vehicle, seed=0, recordings=8, rows=100, noise=0.01, priors=PRIORS):
+def write_case(
+    folder: Path,
+    vehicle: Vehicle,
+    seed: int = 0,
+    recordings: int = 8,
+    rows: int = 100,
+    noise: float = 0.01,
+    priors: Mapping[str, tuple[float, float]] = PRIORS,
+) -> Path:
     """A case of `skid_steer` whose recordings a vehicle made; every recording begins at the origin, along x."""
     (folder / "recordings").mkdir(parents=True)
     rng = np.random.default_rng(seed)
@@ -78,7 +95,7 @@ def write_case(folder, vehicle, seed=0, recordings=8, rows=100, noise=0.01, prio
     return folder
 
 
-def _turn(points, angle):
+def _turn(points: np.ndarray, angle: float) -> np.ndarray:
     """Points in a frame that is turned by an angle."""
     cos, sin = np.cos(angle), np.sin(angle)
     return points @ np.array([[cos, -sin], [sin, cos]])

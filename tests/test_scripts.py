@@ -77,6 +77,7 @@ def test_experiments_with_planners_run_and_resume(script, words, tmp_path):
         ("change_of_truth", ["--change", "ice"], "control"),
         ("warthog", [], "control"),
         ("real_cases", [], "identification"),
+        ("made_up_vehicles", [], "real_recordings"),
     ],
 )
 def test_the_tables_of_the_docs_are_printed_from_the_records(script, words, page):

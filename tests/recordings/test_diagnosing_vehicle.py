@@ -13,8 +13,8 @@ from bayessim_jax.effects import EFFECTS
 from bayessim_jax.recordings.diagnosing import diagnose_case
 from bayessim_jax.recordings.loading import load_case
 from bayessim_jax.recordings.shots import case_model
+from benchmarks.vehicle import THETA, Vehicle, write_case
 from tests.browser import CHROMIUM, open_in_chromium
-from tests.recordings.vehicle_case import THETA, Vehicle, write_case
 
 ROOT = Path(__file__).parents[2]
 CASES = Path(os.environ.get("BAYESSIM_CASES", ROOT.parent / "shared" / "data" / "cases"))
