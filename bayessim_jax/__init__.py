@@ -7,3 +7,10 @@ __version__ = "0.1.0"
 # XLA's pool has as many threads as the machine has cores, unless NPROC says otherwise. In it jaxlib's batched LAPACK
 # kernels wait for each other: on a machine with two cores two of them at once wait for ever.
 os.environ.setdefault("NPROC", str(max(os.cpu_count() or 1, 16)))
+
+# XLA hands the operations of a time step to its pool one by one, which costs several times what they do. With this a
+# loop over less than 8 MB is one piece of code, not only one over less than 1 KB.
+_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=8000000"
+_flags = os.environ.get("XLA_FLAGS", "")
+if "xla_backend_extra_options" not in _flags:
+    os.environ["XLA_FLAGS"] = f"{_flags} {_LOOPS}".strip()

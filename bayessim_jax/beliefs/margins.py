@@ -8,8 +8,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import jax.scipy.special as jax_special
+import numpy as np
+import scipy.special as numpy_special
 from flax import struct
-from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from bayessim_jax.contracts import Scalar
@@ -18,6 +20,8 @@ __all__ = ["Margin", "Margins", "log_normal", "log_uniform", "normal", "uniform"
 
 EDGE = 1e-12
 """Probabilities nearer than this to 0 and 1 have no finite z."""
+STEP = 1e-5
+"""Of z, for derivatives by differences."""
 
 
 @struct.dataclass
@@ -37,42 +41,56 @@ class Margin:
         """The same kind with other numbers, which may be traced."""
         return replace(self, a=a, b=b)
 
-    def value(self, z: Scalar) -> Scalar:
-        """θ at a standard normal z."""
+    def value(self, z: Any) -> Any:
+        """θ at a standard normal z: a JAX array, or a number or array of NumPy's, with which nothing is compiled."""
+        xp, special = _library(z, self.a, self.b)
         if self.kind == "uniform":
-            return self.a + (self.b - self.a) * ndtr(z)
+            return self.a + (self.b - self.a) * special.ndtr(z)
         if self.kind == "log_uniform":
-            return self.a * jnp.exp(jnp.log(self.b / self.a) * ndtr(z))
+            return self.a * xp.exp(xp.log(self.b / self.a) * special.ndtr(z))
         if self.kind == "log_normal":
-            return jnp.exp(self.a + self.b * z)
+            return xp.exp(self.a + self.b * z)
         if not self._cut:
             return self.a + self.b * z
         first, last = self._shares
-        return self.a + self.b * ndtri(jnp.clip(first + (last - first) * ndtr(z), EDGE, 1 - EDGE))
+        return self.a + self.b * special.ndtri(xp.clip(first + (last - first) * special.ndtr(z), EDGE, 1 - EDGE))
 
-    def standard(self, value: Scalar) -> Scalar:
-        """Z of a value; values outside of the support are taken to its edge."""
+    def slope(self, z: float) -> float:
+        """dθ/dz of a number."""
+        z = float(z)
+        return (self.value(z + STEP) - self.value(z - STEP)) / (2 * STEP)
+
+    def standard(self, value: Any) -> Any:
+        """Z of a value, of JAX or NumPy; values outside of the support are taken to its edge."""
+        xp, special = _library(value, self.a, self.b)
         if self.kind == "uniform":
             share = (value - self.a) / (self.b - self.a)
         elif self.kind == "log_uniform":
-            share = jnp.log(jnp.maximum(value, 1e-300) / self.a) / jnp.log(self.b / self.a)
+            share = xp.log(xp.maximum(value, 1e-300) / self.a) / xp.log(self.b / self.a)
         elif self.kind == "log_normal":
-            return (jnp.log(jnp.maximum(value, 1e-300)) - self.a) / self.b
+            return (xp.log(xp.maximum(value, 1e-300)) - self.a) / self.b
         elif not self._cut:
             return (value - self.a) / self.b
         else:
             first, last = self._shares
-            share = (ndtr((value - self.a) / self.b) - first) / (last - first)
+            share = (special.ndtr((value - self.a) / self.b) - first) / (last - first)
         edge = 10 * float(jnp.finfo(jnp.result_type(float)).eps)
-        return ndtri(jnp.clip(share, edge, 1 - edge))
+        return special.ndtri(xp.clip(share, edge, 1 - edge))
 
     @property
     def _cut(self) -> bool:
         return self.low > -float("inf") or self.high < float("inf")
 
     @property
-    def _shares(self) -> tuple[Array, Array]:
-        return ndtr(jnp.asarray((self.low - self.a) / self.b)), ndtr(jnp.asarray((self.high - self.a) / self.b))
+    def _shares(self) -> tuple[float, float]:
+        first, last = (float(numpy_special.ndtr((edge - self.a) / self.b)) for edge in (self.low, self.high))
+        return first, last
+
+
+def _library(*numbers: Any) -> tuple[Any, Any]:
+    """NumPy and SciPy's functions for their numbers, JAX's for those of JAX."""
+    jaxed = any(isinstance(x, jax.Array) for x in numbers)
+    return (jnp, jax_special) if jaxed else (np, numpy_special)
 
 
 def uniform(low: float, high: float) -> Margin:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -51,16 +50,15 @@ def moments_of_theta(
     share = np.asarray(weights) / np.sum(weights)
     means, variances = [], []
     for entry in entries:
-        slopes = np.asarray(jax.jacfwd(bench.margins.theta)(entry.fit.z[:d]))
-        means.append(np.asarray(bench.margins.theta(entry.fit.z[:d])))
-        variances.append(np.diag(slopes @ covariance_of(bench, entry)[:d, :d] @ slopes.T))
+        z = np.asarray(entry.fit.z)[:d]
+        slopes = np.array([m.slope(x) for m, x in zip(bench.margins.each, z, strict=True)])
+        means.append(np.array([m.value(x) for m, x in zip(bench.margins.each, z, strict=True)]))
+        variances.append(slopes**2 * np.diag(covariance_of(bench, entry))[:d])
     apart = (np.array(means) - means[0]) ** 2
     return means[0], np.sqrt(share @ (np.array(variances) + apart))
 
 
 def _slopes(bench: Bench, entry: Entry) -> Float[np.ndarray, " e"]:
     """How fast the effects' numbers change with their z."""
-    columns = bench.columns(entry.candidate)
-    return np.array(
-        [abs(float(jax.grad(bench.each[i].value)(entry.fit.z[bench.d + j]))) for j, i in enumerate(columns)]
-    )
+    own = np.asarray(entry.fit.z)[bench.d :]
+    return np.array([abs(bench.each[i].slope(own[j])) for j, i in enumerate(bench.columns(entry.candidate))])

@@ -10,20 +10,20 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Scalar
 
 from bayessim_jax.beliefs.margins import Margin, Margins, log_uniform, uniform
 from bayessim_jax.effects import EffectParameter, Scales, at, with_effects
 from bayessim_jax.effects.wiring import Wired
 from bayessim_jax.inference.replay import Inputs, Restarted, replay_window
-from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Fit, Shots, solve
+from bayessim_jax.inference.shooting import COMPILER_OPTIONS, DAMPING, Fit, Shots, predict_all, solve
 from bayessim_jax.systems.mjcf import MjcfSystem
 
 __all__ = ["NEAR", "SLOTS", "Bench", "Candidate", "CandidatesOf", "begin_point", "begin_value", "margin_of_effect"]
@@ -158,11 +158,10 @@ class Bench:
         index = np.concatenate([np.arange(self.d), self.d + np.array(columns, int)])
         index = np.concatenate([index, np.full(self.size - len(index), unused)]).astype(int)
         on = np.isin(np.arange(len(self.parameters)), columns)
-        windows = every.y.shape[0]
-        shared = (index, on, [m.a for m in self.each], [m.b for m in self.each], self.neutral)
-        arrays = (jnp.asarray(x) for x in (*shared[:2], *(np.asarray(x, float) for x in shared[2:])))
-        inputs = Tried(every.inputs, *(jnp.broadcast_to(x, (windows, x.size)) for x in arrays))
-        return dataclasses.replace(every, inputs=inputs)
+        ranges = ([m.a for m in self.each], [m.b for m in self.each], self.neutral)
+        inputs = Tried(every.inputs, *map(jax.device_put, (index, on, *(np.asarray(x, float) for x in ranges))))
+        axes: Any = (0, None, None, None, None, None)
+        return dataclasses.replace(every, inputs=inputs, axes=Tried(*axes))
 
     def starts(self, candidate: Candidate, z: Float[Array, " d"]) -> list[Float[Array, " k"]]:
         """Points to begin from: θ as given, the effects a little off neutral, at their start values, and mirrored."""
@@ -172,11 +171,11 @@ class Bench:
         points = [near, begin] if len(own) and np.abs(near - begin).max() > 1e-9 else [begin]
         points += [-begin] if any(p.low < 0.0 for p in own) else []
         rest = np.zeros(self.slots - len(columns))
-        return [jnp.concatenate([z, jnp.asarray(x), jnp.asarray(rest)]) for x in points]
+        return [jax.device_put(np.concatenate([np.asarray(z), x, rest])) for x in points]
 
     def free(self, candidate: Candidate) -> Bool[Array, " k"]:
         """Which of the numbers that a fit finds are free."""
-        return jnp.arange(self.size) < self.d + len(self.columns(candidate))
+        return jax.device_put(np.arange(self.size) < self.d + len(self.columns(candidate)))
 
     @cached_property
     def predict(self) -> Any:
@@ -199,7 +198,7 @@ class Bench:
         for k in candidate.effects:
             for i in range(self.first[k], self.first[k + 1]):
                 place = self.columns(candidate).index(i)
-                value = float(self.each[i].value(x[self.d + place]))
+                value = float(self.each[i].value(float(x[self.d + place])))
                 named[f"{self.label(k)}/{self.parameters[i].name}"] = value
         return named
 
@@ -210,18 +209,20 @@ class Bench:
         delta: Float[Array, "windows n"],
         sigma: Float[Array, " obs"],
         *,
-        steps: int = 12,
+        steps: int = 20,
+        damping: float | Scalar = DAMPING,
     ) -> Fit:
         """Fit a candidate from a point."""
         free, shots = self.free(candidate), self.setup(candidate)
-        return solve(self.predict, shots, x, delta, sigma, free, steps=jnp.asarray(steps), step=self.step)
+        how = {"steps": jnp.asarray(steps), "step": self.step, "damping": jnp.asarray(damping)}
+        return solve(self.predict, shots, x, delta, sigma, free, **how)
 
     def replay(
         self, candidate: Candidate, x: Float[Array, " k"], shots: Shots, delta: Float[Array, " n"] | float = 0.0
     ) -> Float[np.ndarray, "windows rows obs"]:
         """Predictions of windows from their recorded initial states, or from beside them."""
         still = jnp.broadcast_to(delta, (shots.y.shape[0], shots.spread.size))
-        return np.asarray(_replay(self.predict, x, still, self.setup(candidate, shots).inputs))
+        return np.asarray(_replay(self.predict, self.setup(candidate, shots), x, still))
 
     def scatter(
         self,
@@ -246,7 +247,7 @@ def begin_point(
 ) -> Float[np.ndarray, " e"]:
     """The z of `begin_value` of every parameter."""
     pairs = zip(parameters, margins, strict=True)
-    return np.array([float(m.standard(jnp.asarray(begin_value(p, share), float))) for p, m in pairs])
+    return np.array([m.standard(begin_value(p, share)) for p, m in pairs])
 
 
 def begin_value(p: EffectParameter, share: float = 1.0) -> float:
@@ -255,6 +256,4 @@ def begin_value(p: EffectParameter, share: float = 1.0) -> float:
     return p.neutral + share * (p.start - p.neutral) if grows and share < 1.0 else p.start
 
 
-@partial(jax.jit, static_argnames="predict", compiler_options=COMPILER_OPTIONS)
-def _replay(predict: Any, x: Array, delta: Array, inputs: Tried) -> Array:
-    return jax.vmap(predict, in_axes=(None, 0, 0))(x, delta, inputs)
+_replay = jax.jit(predict_all, static_argnames="predict", compiler_options=COMPILER_OPTIONS)

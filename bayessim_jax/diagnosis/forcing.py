@@ -85,6 +85,8 @@ def force_of(
             begun = jax.tree.map(lambda m: jnp.asarray(m, time.dtype), effect.begin(values, moment(*first)))
             if earlier is not None:
                 begun = effect.recall(values, begun, *earlier, period)
+            if not jax.tree.leaves(begun):
+                return jax.vmap(lambda now: once(begun, now)[1])(rows).reshape(-1, steps).mean(-1)
             return jax.lax.scan(once, begun, rows)[1].reshape(-1, steps).mean(-1)
 
         return jax.vmap(window)(time, joint, other, earlier)

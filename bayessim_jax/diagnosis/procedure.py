@@ -97,8 +97,8 @@ class _Work:
         free = self.bench.d + len(self.bench.columns(candidate))
         for _ in range(ROUNDS):
             sigma = estimate_noise(self.bench.shots, fit, self.floor, free, LEAST_SHARE)
-            change = float(jnp.abs(jnp.log(sigma / fit.sigma)).max())
-            fit = self.bench.fit(candidate, fit.z, fit.delta, sigma)
+            change = np.abs(np.log(np.asarray(sigma) / np.asarray(fit.sigma))).max()
+            fit = self.bench.fit(candidate, fit.z, fit.delta, sigma, damping=fit.damping)
             if change < 0.03:
                 break
         return fit
@@ -131,8 +131,9 @@ class Problem:
         """Pairs to be held against some of the windows."""
         count = len(self.group)
         rows = np.unique(np.linspace(0, count - 1, min(SCREENED, count)).astype(int))
-        motion, inputs = jax.tree.map(lambda x: x[rows], (self.motion, self.shots.inputs))
-        shots = dataclasses.replace(self.shots, inputs=inputs, y=self.shots.y[rows], measured=self.shots.measured[rows])
+        every = (self.motion, self.shots.inputs, self.shots.y, self.shots.measured)
+        motion, inputs, y, measured = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[rows]), every)
+        shots = dataclasses.replace(self.shots, inputs=inputs, y=y, measured=measured)
         if isinstance(self.system, Restarted):
             return Screen(SimulatedScene(Bench(self.system, self.margins, pairs, self.scales, shots, slots=slots)))
         assert motion is not None
@@ -422,16 +423,14 @@ def _with_numbers_of(bench: Bench, best: Entry, other: Entry) -> Float[Array, " 
     """Another candidate's point with the numbers of the best, as far as they have the same names."""
     found = dict(zip(bench.columns(best.candidate), np.asarray(best.fit.z)[bench.d :].tolist(), strict=False))
     mine = bench.columns(other.candidate)
-    replaced = {
-        bench.parameters[i].name: bench.each[i].value(jnp.asarray(z)) for i, z in found.items() if i not in mine
-    }
+    replaced = {bench.parameters[i].name: bench.each[i].value(z) for i, z in found.items() if i not in mine}
     point = np.array(other.fit.z)
     point[: bench.d] = best.fit.z[: bench.d]
     for j, i in enumerate(mine):
         if i in found:
             point[bench.d + j] = found[i]
         elif bench.parameters[i].name in replaced:
-            point[bench.d + j] = float(bench.each[i].standard(replaced[bench.parameters[i].name]))
+            point[bench.d + j] = bench.each[i].standard(replaced[bench.parameters[i].name])
     return jnp.asarray(point)
 
 
@@ -502,7 +501,7 @@ def _folds(group: Int[np.ndarray, " windows"]) -> Bool[Array, "folds windows"]:
     """The windows of every group of recordings; of one recording alone, groups of its windows."""
     units = group if len(set(group.tolist())) > 1 else np.arange(len(group))
     labels = sorted(set(units.tolist()))
-    return jnp.asarray(np.array([np.isin(units, labels[i::FOLDS]) for i in range(min(FOLDS, len(labels)))]))
+    return jax.device_put(np.array([np.isin(units, labels[i::FOLDS]) for i in range(min(FOLDS, len(labels)))]))
 
 
 def _enter(work: _Work, candidate: Candidate, fit: Fit, known: Float[np.ndarray, "..."] | float = 0.0) -> Entry:
@@ -518,5 +517,6 @@ def _enter(work: _Work, candidate: Candidate, fit: Fit, known: Float[np.ndarray,
     recalls = any(getattr(bench.pairs[k][0], "recalls", False) for k in candidate.effects)
     judged = work.remembered if recalls else None
     misfit = judge_misfit(misfit_key, np.asarray(fit.misses), fit.along_states, np.asarray(measured), known, judged)
-    share = float(-0.5 * fit.z @ fit.z - 0.5 * jnp.linalg.slogdet(fit.precision)[1])
+    z, precision = np.asarray(fit.z), np.asarray(fit.precision)
+    share = float(-0.5 * z @ z - 0.5 * np.linalg.slogdet(precision)[1])
     return Entry(candidate, bench.names(candidate), fit, scores, misfit, log_share=share, seats=bench.seats(candidate))

@@ -76,7 +76,7 @@ class Scene(CandidatesOf):
             for each in zip(self.parameters, self.margin, strict=True)
         ]
         self.ranges = [
-            (jnp.asarray([m.a for m in each], float), jnp.asarray([m.b for m in each], float)) for each in self.margin
+            (_device(np.array([m.a for m in each])), _device(np.array([m.b for m in each]))) for each in self.margin
         ]
         self.model = system.engine.model
         self.sites = [find_site(self.model, place) for _, place in self.pairs]
@@ -87,7 +87,7 @@ class Scene(CandidatesOf):
         rows = system.substeps
         self.fine = next(s for s in range(min(FINE, rows), 0, -1) if rows % s == 0)
         self.h = system.dt / self.fine
-        self.times = motion.start[:, None] + self.h * jnp.arange(motion.ctrl.shape[1] * self.fine)
+        self.times = _device(np.asarray(motion.start)[:, None] + self.h * np.arange(motion.ctrl.shape[1] * self.fine))
         self._around: dict[bool, _Around] = {}
         self._home: tuple[bytes, _Around] | None = None
         self._kept: dict[Any, Any] = {}
@@ -211,8 +211,8 @@ class Scene(CandidatesOf):
     @cached_property
     def _rates(self) -> tuple[Array, Array]:
         """Accelerations and their rates along the motion."""
-        acceleration = jnp.asarray(jnp.gradient(self.motion.qvel, self.system.dt, axis=1))
-        return acceleration, jnp.asarray(jnp.gradient(acceleration, self.system.dt, axis=1))
+        acceleration = np.gradient(np.asarray(self.motion.qvel), self.system.dt, axis=1)
+        return _device(acceleration), _device(np.gradient(acceleration, self.system.dt, axis=1))
 
     def _restored(self, candidate: Candidate, p: np.ndarray) -> tuple[Motion, list[tuple[Any, ...]]]:
         """The true motion behind what sensors with effects showed.
@@ -227,7 +227,7 @@ class Scene(CandidatesOf):
             joint = self.sites[k].joint
             q, v = int(self.model.jnt_qposadr[joint]), int(self.model.jnt_dofadr[joint])
             channels = [c.name for c in self.system.channels]
-            rows = motion.start[:, None] + self.system.dt * jnp.arange(motion.qpos.shape[1])
+            rows = np.asarray(motion.start)[:, None] + self.system.dt * np.arange(motion.qpos.shape[1])
             seen = (motion.qpos[..., q], motion.qvel[..., v], *(rate[..., v] for rate in self._rates))
             prompt = has_rate(name, channels)
             new_q, new_v, along, along_v, slope = restore_readings(
@@ -275,10 +275,11 @@ class Scene(CandidatesOf):
         key = ("earlier", joint)
         if key not in around.kept:
             position, velocity = self.motion.earlier
-            position, velocity = position[..., int(self.model.jnt_qposadr[joint])], velocity[..., self._dof(joint)]
-            past, driving = jnp.moveaxis(self.motion.past, -1, 0), actuators_of(self.model, joint)
-            drive = drive_of(self.model, self._numbers(around), driving, past, position, velocity)
-            around.kept[key] = position, velocity, drive + jnp.zeros_like(position)
+            place = int(self.model.jnt_qposadr[joint]), self._dof(joint)
+            driving, theta = tuple(actuators_of(self.model, joint)), around.p[: self.d]
+            around.kept[key] = _look_back(
+                self.system, self.margins, place, driving, theta, self.motion.past, position, velocity
+            )
         return around.kept[key]
 
     def _numbers(self, around: _Around) -> Numbers:
@@ -300,13 +301,14 @@ class Scene(CandidatesOf):
         key = (tuple(actuators), looks)
         if key not in self._kept:
             older, coarse, recent = split_history(self.motion.past, self.system.dt)
-            rows = self.motion.ctrl if looks else jnp.concatenate([recent, self.motion.ctrl], 1)
-            commands = jnp.repeat(self._limited(rows, actuators), self.fine, 1)
+            older, recent, ctrl = map(np.asarray, (older, recent, self.motion.ctrl))
+            rows = ctrl if looks else np.concatenate([recent, ctrl], 1)
+            commands = np.repeat(self._limited(rows, actuators), self.fine, 1)
             before = 0 if looks else recent.shape[1] * self.fine
-            self._kept[key] = commands, self._limited(older, actuators), coarse, before
+            self._kept[key] = _device(commands), _device(self._limited(older, actuators)), coarse, before
         return self._kept[key]
 
-    def _limited(self, rows: Float[Array, "windows rows nu"], actuators: Sequence[int]) -> Array:
+    def _limited(self, rows: Float[np.ndarray, "windows rows nu"], actuators: Sequence[int]) -> np.ndarray:
         """Commands of some actuators within their limits."""
         limits = [self.model.actuator_ctrlrange[i] for i in actuators]
         limited = [bool(self.model.actuator_ctrllimited[i]) for i in actuators]
@@ -314,7 +316,7 @@ class Scene(CandidatesOf):
             np.array([r[k] if on else bound for r, on in zip(limits, limited, strict=True)])
             for k, bound in ((0, -np.inf), (1, np.inf))
         )
-        return jnp.clip(rows[..., list(actuators)], low, high)
+        return np.clip(rows[..., list(actuators)], low, high)
 
     def _joint(self, joint: int, around: _Around, actuators: Sequence[int]) -> Joint:
         """What effects see of a joint; the drive is that of some actuators, or of all that the joint has."""
@@ -326,6 +328,11 @@ class Scene(CandidatesOf):
                 self.system, self.margins, place, driving, self.fine, around.p[: self.d], around.motion, around.lin
             )
         return around.kept[key]
+
+
+def _device(x: np.ndarray) -> Array:
+    """Where programs take it from without a copy, and without a program of its own."""
+    return jax.device_put(x.astype(jnp.result_type(float)))
 
 
 @partial(jax.jit, static_argnames=("place", "actuators", "fine"), compiler_options=COMPILER_OPTIONS)
@@ -356,6 +363,25 @@ def _look_at(
     drive = drive_of(engine.model, numbers, actuators, commands, position, velocity) + jnp.zeros_like(position)
     acceleration, inertia = (jnp.repeat(rows, fine, axis=1) for rows in (rise / system.dt, inertia))
     return Joint(position, velocity, acceleration, inertia, drive)
+
+
+@partial(jax.jit, static_argnames=("place", "actuators"), compiler_options=COMPILER_OPTIONS)
+def _look_back(
+    system: MjcfSystem,
+    margins: Margins,
+    place: tuple[int, int],
+    actuators: tuple[int, ...],
+    z: Array,
+    past: Array,
+    position: Array,
+    velocity: Array,
+) -> tuple[Array, Array, Array]:
+    """Positions and velocities of one joint before the windows, and what actuators exerted on it."""
+    model = system.engine.model
+    position, velocity = position[..., place[0]], velocity[..., place[1]]
+    numbers = read_numbers(model, system.engine.writes, margins.theta(z))
+    drive = drive_of(model, numbers, actuators, jnp.moveaxis(past, -1, 0), position, velocity)
+    return position, velocity, drive + jnp.zeros_like(position)
 
 
 @partial(jax.jit, static_argnames=("nv", "size"), compiler_options=COMPILER_OPTIONS)

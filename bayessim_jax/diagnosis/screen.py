@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import chain, product
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -174,7 +175,7 @@ class Screen:
             level = noise_level(squares, self.counts, self.d + own + delta.size, self.floor, LEAST_SHARE)
             score, sigma = self._profile(r, sigma) - own, level
         return (
-            Screened(candidate, jnp.asarray(p), delta, sigma, float(curvature.cost), score)
+            Screened(candidate, jax.device_put(p), delta, sigma, float(curvature.cost), score)
             if np.isfinite(score)
             else None
         )
@@ -183,7 +184,7 @@ class Screen:
         """The simulator without effects."""
         p = np.zeros(self.d + self.slots)
         p[: self.d] = z
-        delta = jnp.zeros((len(self.shots.y), self.shots.spread.size))
+        delta = jax.device_put(np.zeros((len(self.shots.y), self.shots.spread.size)))
         found = self.settle(Candidate(), p, delta, sigma)
         if found is None:
             raise ValueError("the simulator diverges along the recorded motion.")
@@ -235,7 +236,8 @@ class Screen:
         """What a candidate leaves of the misfit."""
         _, r, slopes = self.scene.assess(found.candidate, np.asarray(found.p), found.delta, found.sigma)
         n = found.delta.shape[-1]
-        own, residual = in_units(slopes[:, -n:], found.sigma), np.asarray(r * found.sigma)
+        own = in_units(np.asarray(slopes)[:, -n:], found.sigma)
+        residual = np.asarray(r) * np.asarray(found.sigma)
         return judge_misfit(key, residual, own, np.asarray(self.shots.measured))
 
     def own(self, begun: Begun) -> Float[np.ndarray, " e"]:

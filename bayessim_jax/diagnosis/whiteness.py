@@ -64,28 +64,23 @@ def _cosines(rows: int) -> Float[np.ndarray, "modes rows"]:
     return modes
 
 
-def _slow(r: Array, cosines: Array) -> Array:
+def _slow(r: Any, cosines: Any, xp: Any = np) -> Any:
     """Power in the slow cosines, for every window and channel."""
-    return (jnp.einsum("mr,wro->wmo", cosines, r) ** 2).sum(1)
+    return (xp.einsum("mr,wro->wmo", cosines, r) ** 2).sum(1)
 
 
-def _basis(columns: Array) -> Array:
+def _basis(columns: Float[np.ndarray, "windows k c"]) -> Float[np.ndarray, "windows k c"]:
     """Orthonormal columns with the span of some, and zeros where these depend on others, as what is known does."""
-    q, r = jnp.linalg.qr(columns)
-    size = jnp.abs(jnp.diagonal(r, axis1=-2, axis2=-1))
-    least = ROUNDED * jnp.finfo(size.dtype).eps * size.max(-1, keepdims=True)
+    q, r = np.linalg.qr(columns)
+    size = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
+    least = ROUNDED * np.finfo(size.dtype).eps * size.max(-1, keepdims=True)
     return q * (size > least)[:, None]
 
 
-def _absorb(r: Array, q: Array) -> Array:
+def _absorb(r: Any, q: Any, xp: Any = np) -> Any:
     """What windows' initial states leave of residuals; `q` is a basis of what they can explain."""
     flat = r.reshape(len(r), -1)
-    return (flat - jnp.einsum("wkc,wc->wk", q, jnp.einsum("wkc,wk->wc", q, flat))).reshape(r.shape)
-
-
-@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
-def _slow_left(r: Array, q: Array, cosines: Array) -> Float[Array, "windows obs"]:
-    return _slow(_absorb(r, q), cosines)
+    return (flat - xp.einsum("wkc,wc->wk", q, xp.einsum("wkc,wk->wc", q, flat))).reshape(r.shape)
 
 
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)
@@ -94,7 +89,7 @@ def _null(keys: Any, q: Array, measured: Array, cosines: Array, known: Array) ->
 
     def one(key: Any) -> Array:
         noise = jnp.where(measured, known + jax.random.normal(key, measured.shape, q.dtype), 0.0)
-        return _slow(_absorb(noise, q), cosines)
+        return _slow(_absorb(noise, q, jnp), cosines, jnp)
 
     return jax.lax.map(one, keys, batch_size=16)
 
@@ -102,7 +97,7 @@ def _null(keys: Any, q: Array, measured: Array, cosines: Array, known: Array) ->
 def judge_misfit(
     key: PRNGKeyArray,
     residual: Float[np.ndarray, "windows rows obs"],
-    slopes: Float[Array, "windows n k"],
+    slopes: Float[np.ndarray, "windows n k"],
     measured: Bool[np.ndarray, "windows rows obs"],
     known: Float[np.ndarray, "windows rows obs"] | float = 0.0,
     judged: Bool[np.ndarray, " windows"] | None = None,
@@ -117,14 +112,13 @@ def judge_misfit(
     noise = np.maximum(difference_noise(residual, measured), 1e-300)
     rows, obs = measured.shape[1:]
     slopes = (slopes.reshape(*slopes.shape[:2], rows, obs) / noise).reshape(slopes.shape)
-    q = _basis(jnp.swapaxes(slopes, 1, 2))
-    cosines, there = jnp.asarray(_cosines(rows)), jnp.asarray(measured)
-    power = np.asarray(_slow(jnp.asarray(np.where(measured, residual / noise, 0.0)), cosines))
-    error = jnp.where(there, jnp.asarray(known / noise * np.ones(measured.shape)), 0.0)
-    excused = np.asarray(_slow_left(error, q, cosines)).sum(1)
+    q, cosines = _basis(np.swapaxes(slopes, 1, 2)), _cosines(rows)
+    power = _slow(np.where(measured, residual / noise, 0.0), cosines)
+    error = np.where(measured, known / noise * np.ones(measured.shape), 0.0)
+    excused = _slow(_absorb(error, q), cosines).sum(1)
     share = np.minimum(power.sum(1) / np.maximum(excused, 1e-30), 1.0)
     keys = jax.random.split(key, BOOTSTRAPS)
-    null = np.asarray(_null(keys, q, there, cosines, error * jnp.asarray(np.sqrt(share))[:, None, None]))
+    null = np.asarray(_null(keys, q, measured, cosines, error * np.sqrt(share)[:, None, None]))
     power, null = power * counts[:, None], null * counts[:, None]
     p_value = (1 + (null.sum((1, 2)) >= power.sum()).sum()) / (1 + BOOTSTRAPS)
     return Misfit(float(p_value), power - null.mean(0), noise, counts)

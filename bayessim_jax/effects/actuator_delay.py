@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from bayessim_jax.contracts import Scalar
 from bayessim_jax.effects.contract import ActEffect, EffectParameter, Memory, Moment, Scales, Values
@@ -59,13 +60,22 @@ class ActuatorDelay(ActEffect):
             late = jnp.where(whole & bit, shifted, late)
             bit *= 2
         new = late[-count:] + rest * (late[-count - 1 : -1] - late[-count:])
-        places = back + jnp.arange(count)[:, None] - jnp.arange(back)
-        return new, samples[places]
+        return new, _windows(samples[1:], count, back)[:, ::-1]
 
 
 def samples_back(h: float) -> int:
     """How many earlier time steps are remembered."""
     return min(max(math.ceil(RECENT / h - 1e-9), LEAST), MOST)
+
+
+def _windows(samples: Float[Array, " n"], count: int, length: int) -> Float[Array, "count length"]:
+    """Numbers i to i + length in row i: rows that are each one longer than the numbers begin one later.
+
+    Nothing is looked up, so that of rows that nobody reads none is made.
+    """
+    size = len(samples)
+    flat = jnp.broadcast_to(samples, (count + 1, size)).reshape(-1)
+    return flat[: count * (size + 1)].reshape(count, size + 1)[:, :length]
 
 
 def _split(steps: Scalar, back: int) -> tuple[Scalar, Scalar]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 __all__ = ["RECENT", "split_history"]
@@ -25,4 +24,4 @@ def split_history(
     older = older[..., older.shape[-2] % together :, :]
     steps = older.shape[-2] // together
     groups = older.reshape(*older.shape[:-2], steps, together, older.shape[-1])
-    return jnp.asarray(groups).mean(-2), together * period, past
+    return groups.mean(-2), together * period, past

@@ -17,10 +17,11 @@ TASKS = "cpu-parallel-task-assigner"
 """The pass of XLA that hands every operation of a time step to a pool of threads, which costs many times the operation
 from some hundred simulations on."""
 WIDE = {"xla_cpu_prefer_vector_width": "512"}
-CPU_OPTIONS = {"xla_disable_hlo_passes": f"{TASKS},cse_barrier_expander", **WIDE}
+CPU_OPTIONS = {"xla_disable_hlo_passes": f"{TASKS},cse_barrier_expander,small-while-loop-hoisting", **WIDE}
 """No splitting of each small loop over threads, barriers that hold until code is made, and wide vectors.
 
-The second pass would let the compiler repeat a step's equations for every joint.
+The second pass would let the compiler repeat a step's equations for every joint; loops that hold barriers cannot be
+made one piece of code, as those without them are (`docs/architecture.md`).
 """
 
 

@@ -38,6 +38,7 @@ __all__ = [
     "expand",
     "in_units",
     "normal_equations",
+    "predict_all",
     "Ridge",
     "profile",
     "residuals",
@@ -48,6 +49,11 @@ __all__ = [
 
 Predict = Callable[[Float[Array, " d"], Float[Array, " n"], Any], Float[Array, "rows obs"]]
 """`predict(z, δ, window)`: what the sensors show of one window, in every row."""
+
+
+TOLERANCE, ROUGH, DAMPING = 1e-7, 1e-4, 1e-3
+"""Of the solver: the share of the cost that it ends with, by derivatives and by differences, and the damping that it
+begins with."""
 
 
 @struct.dataclass
@@ -65,6 +71,8 @@ class Shots:
     """Prior mean of z."""
     shift: Float[Array, "windows n"] | float = 0.0
     """Prior mean of δ."""
+    axes: Any = struct.field(pytree_node=False, default=0)
+    """`vmap`'s `in_axes` of the inputs: None for what all windows share."""
 
 
 @struct.dataclass
@@ -103,11 +111,13 @@ class Fit:
     cost: Scalar
     steps: Int[Array, ""]
     converged: Bool[Array, ""]
+    damping: Scalar | float = DAMPING
+    """Of the solver's last step."""
 
     @property
-    def misses(self) -> Float[Array, "windows rows obs"]:
+    def misses(self) -> Float[np.ndarray, "windows rows obs"]:
         """What was measured less what is predicted, in the channels' units."""
-        return self.r * self.sigma
+        return np.asarray(self.r) * np.asarray(self.sigma)
 
     @property
     def usual_move(self) -> Float[np.ndarray, " n"]:
@@ -127,20 +137,24 @@ class Fit:
         )
 
     @property
-    def along_states(self) -> Float[Array, "windows n k"]:
+    def along_states(self) -> Float[np.ndarray, "windows n k"]:
         """Derivatives of predictions along δ/S, in the channels' units."""
-        return in_units(self.slopes[:, self.z.size :], self.sigma)
+        return in_units(np.asarray(self.slopes)[:, self.z.size :], self.sigma)
 
 
-def in_units(slopes: Float[Array, "windows n k"], sigma: Float[Array, " obs"]) -> Float[Array, "windows n k"]:
+def in_units(slopes: Float[np.ndarray, "windows n k"], sigma: Float[Array, " obs"]) -> Float[np.ndarray, "windows n k"]:
     """Derivatives of predictions / σ, rows and channels in one axis, in the channels' units."""
-    return (slopes.reshape(*slopes.shape[:-1], -1, sigma.size) * sigma).reshape(slopes.shape)
+    return (slopes.reshape(*slopes.shape[:-1], -1, sigma.size) * np.asarray(sigma)).reshape(slopes.shape)
 
 
 def residuals(predict: Predict, shots: Shots, z: Array, delta: Array, sigma: Array) -> Float[Array, "windows rows obs"]:
     """(y − prediction) / σ, zero where nothing was measured; not finite where the simulation is not."""
-    y = jax.vmap(predict, in_axes=(None, 0, 0))(z, delta, shots.inputs)
-    return jnp.where(shots.measured, (shots.y - y) / sigma, 0.0)
+    return jnp.where(shots.measured, (shots.y - predict_all(predict, shots, z, delta)) / sigma, 0.0)
+
+
+def predict_all(predict: Predict, shots: Shots, z: Array, delta: Array) -> Float[Array, "windows rows obs"]:
+    """What the sensors show of all windows."""
+    return jax.vmap(predict, in_axes=(None, 0, shots.axes))(z, delta, shots.inputs)
 
 
 def expand(
@@ -151,24 +165,21 @@ def expand(
     Forward-mode derivatives; central differences of length `step` where it is not zero, for simulators that are not
     differentiable.
     """
-    d, n = z.size, delta.shape[-1]
-    scale = jnp.concatenate([jnp.ones(d), shots.spread])
+    d, n, windows = z.size, delta.shape[-1], delta.shape[0]
 
-    def one(x: Array, inputs: Any, y: Array, measured: Array) -> tuple[Array, Array]:
-        def prediction(x: Array) -> Array:
-            return predict(x[:d], x[d:], inputs)
-
-        along = jnp.diag(scale)
+    def moved(along: Array, beside: Array) -> tuple[Array, Array]:
+        move = along, jnp.broadcast_to(beside, delta.shape)
         if step:
-            ahead, behind = (jax.vmap(lambda m, s=s: prediction(x + s * step * m))(along) for s in (1, -1))
-            value, slopes = prediction(x), (ahead - behind) / (2 * step)
-        else:
-            value, slopes = jax.vmap(lambda m: jax.jvp(prediction, (x,), (m,)), out_axes=(None, 0))(along)
-        r = jnp.where(measured, (y - value) / sigma, 0.0)
-        return r.reshape(-1), jnp.where(measured, slopes / sigma, 0.0).reshape(d + n, -1)
+            ahead, behind = (predict_all(predict, shots, z + s * move[0], delta + s * move[1]) for s in (step, -step))
+            return predict_all(predict, shots, z, delta), (ahead - behind) / (2 * step)
+        return jax.jvp(partial(predict_all, predict, shots), (z, delta), move)
 
-    points = jnp.concatenate([jnp.broadcast_to(z, (delta.shape[0], d)), delta], axis=-1)
-    return jax.vmap(one)(points, shots.inputs, shots.y, shots.measured)
+    # directions outside and windows inside: z is common to all windows, and theirs lie side by side
+    move = jnp.eye(d + n, d), jnp.eye(d + n, n, -d) * shots.spread
+    value, slopes = jax.vmap(moved, out_axes=(None, 1))(*move)
+    r = jnp.where(shots.measured, (shots.y - value) / sigma, 0.0)
+    slopes = jnp.where(shots.measured[:, None], slopes / sigma, 0.0)
+    return r.reshape(windows, -1), slopes.reshape(windows, d + n, -1)
 
 
 def normal_equations(
@@ -200,9 +211,6 @@ def eliminate(c: Curvature, damping: Scalar | float = 0.0) -> tuple[Array, Array
     return precision, gradient, toward, shift
 
 
-TOLERANCE, ROUGH, DAMPING = 1e-7, 1e-4, 1e-3
-"""Of the solver: the share of the cost that it ends with, by derivatives and by differences, and the damping that it
-begins with."""
 COMPILER_OPTIONS = {"xla_cpu_use_fusion_emitters": False, "xla_disable_hlo_passes": TASKS, **WIDE}
 """For programs of small arrays on a CPU: compilation takes half as long, vectors are wide, and no operation of a time
 step is cut up for a pool of threads."""
@@ -219,12 +227,14 @@ def solve(
     *,
     steps: int | Int[Array, ""] = 30,
     step: float = 0.0,
+    damping: float | Scalar = DAMPING,
 ) -> Fit:
     """Levenberg-Marquardt on (z, δ₁, …, δ_W) from a starting point; z stays as it is where it is not `free`.
 
-    A step that does not lower the cost, or leads to a number that is not finite, is refused and shortened. The solver
-    has converged when two accepted steps in a row lower the cost by less than 1e-7 of it (1e-4 where derivatives are
-    differences, as where bodies collide), or when no step does.
+    A step that does not lower the cost, or leads to a number that is not finite, is refused and shortened; where the
+    cost falls by less than a quarter of what the slopes promise, the next one is shorter, too. `damping` is where that
+    begins. The solver has converged when two accepted steps in a row lower the cost by less than 1e-7 of it (1e-4 where
+    derivatives are differences, as where bodies collide), or when no step does.
     """
     kind = jnp.result_type(z)
     z, delta, sigma = z.astype(kind), delta.astype(kind), sigma.astype(kind)
@@ -246,31 +256,39 @@ def solve(
     rest = shots.y.shape[1] * shots.y.shape[2]
     unseen = (jnp.zeros((windows, rest), kind), jnp.zeros((windows, d + n, rest), kind))
 
+    def propose(at: Any, here: Curvature, damping: Array) -> tuple[Any, Array]:
+        """Where a step leads, and by how much the cost should fall."""
+        precision, gradient, toward, shift = eliminate(here, damping)
+        precision = jnp.where(held, precision, jnp.eye(d)) + damping * jnp.diag(jnp.diagonal(here.hessian))
+        move = jnp.where(free, jnp.linalg.solve(precision, jnp.where(free, gradient, 0.0)), 0.0)
+        move = move * jnp.minimum(1.0, 2.0 / jnp.maximum(jnp.abs(move).max(initial=0.0), 1e-12))
+        moves = shift - toward @ move
+        stiff = move**2 @ jnp.diagonal(here.hessian) + (moves**2 * jnp.diagonal(here.own, axis1=-2, axis2=-1)).sum()
+        promised = 0.5 * (move @ here.gradient + (moves * here.own_gradient).sum() + damping * stiff)
+        return (at[0] + move, at[1] + moves * shots.spread), promised
+
     def body(carry: Any) -> Any:
-        tried, kept, here, damping, count, small = carry
+        tried, kept, here, damping, promised, count, small = carry
         seen = expand(predict, shots, tried[0], tried[1], sigma, step)
         there = normal_equations(*seen, tried[0] - shots.center, (tried[1] - shots.shift) / shots.spread)
         sound = jnp.isfinite(there.cost) & jnp.isfinite(there.gradient).all() & jnp.isfinite(there.hessian).all()
         better = sound & (there.cost <= here.cost)
         gain = jnp.where(better, (here.cost - there.cost) / jnp.maximum(jnp.abs(here.cost), 1e-12), 1.0)
-        gain = jnp.where(jnp.isfinite(gain), gain, 1.0)
+        gain, before = jnp.where(jnp.isfinite(gain), gain, 1.0), here.cost
         kept, here = jax.tree.map(lambda x, y: jnp.where(better, x, y), ((*tried, *seen), there), (kept, here))
-        z, delta = kept[:2]
-        damping = jnp.where(better, jnp.maximum(damping / 5, 1e-9), damping * 8)
-        precision, gradient, toward, shift = eliminate(here, damping)
-        precision = jnp.where(held, precision, jnp.eye(d)) + damping * jnp.diag(jnp.diagonal(here.hessian))
-        move = jnp.where(free, jnp.linalg.solve(precision, jnp.where(free, gradient, 0.0)), 0.0)
-        move = move * jnp.minimum(1.0, 2.0 / jnp.maximum(jnp.abs(move).max(initial=0.0), 1e-12))
-        moves = (shift - toward @ move) * shots.spread
+        fulfilled = (before - there.cost) / jnp.maximum(promised, 1e-300)
+        eased = jnp.where(fulfilled > 0.75, damping / 5, jnp.where(fulfilled > 0.25, damping, damping * 2))
+        damping = jnp.where(better, jnp.maximum(eased, 1e-9), damping * 8)
+        tried, promised = propose(kept[:2], here, damping)
         small = jnp.where(better & (gain < tolerance), small + 1, jnp.where(better, 0, small))
-        return (z + move, delta + moves), kept, here, damping.astype(kind), count + 1, small
+        return tried, kept, here, damping.astype(kind), promised, count + 1, small
 
     def more(carry: Any) -> Any:
-        _, _, here, damping, count, small = carry
+        _, _, here, damping, _, count, small = carry
         return (count < steps) & (small < 2) & (damping < 1e9) & (jnp.isfinite(here.cost) | (count == 0))
 
-    start = ((z, delta), (z, delta, *unseen), nothing, jnp.asarray(DAMPING, kind), jnp.array(0), jnp.array(0))
-    _, (z, delta, r, slopes), here, last, count, small = jax.lax.while_loop(more, body, start)
+    start = ((z, delta), (z, delta, *unseen), nothing, jnp.asarray(damping, kind), zero, jnp.array(0), jnp.array(0))
+    _, (z, delta, r, slopes), here, last, _, count, small = jax.lax.while_loop(more, body, start)
     precision, _, _, shift = eliminate(here)
     return Fit(
         z=z,
@@ -283,6 +301,7 @@ def solve(
         cost=here.cost,
         steps=count,
         converged=(small >= 2) | (last >= 1e9),
+        damping=last,
     )
 
 

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -369,15 +370,15 @@ def _fit_residual_force(key: Array, taken: _Taken, none: Entry) -> _Residual | N
         alone = screen.settle(Candidate((k,)), nothing.p, nothing.delta, nothing.sigma, iterations=LONG)
         left.append(1.0 if alone is None else share_left(screen.misfit(key, alone), before))
     bench = problem.bench(pairs, slots)
-    weights = np.asarray(jnp.stack([bench.each[0].value(z) for z in found.p[bench.d :]]))
+    weights = bench.each[0].value(np.asarray(found.p)[bench.d :])
     gears, forces = _gears(model), {}
     rows = taken.pieces.valid
     time = (taken.pieces.start[:, None] + taken.pieces.time[:, :-1])[rows]
     for k, (place, (_, q, v)) in enumerate(zip(places, joints, strict=True)):
         position, velocity = (np.asarray(x)[rows] for x in (motion.qpos[:, :-1, q], motion.qvel[:, :-1, v]))
         drive = (np.asarray(motion.ctrl) @ gears[:, v])[rows] if motion.ctrl.shape[-1] else np.zeros(rows.sum())
-        state = (jnp.asarray(position), jnp.asarray(velocity), jnp.asarray(drive))
-        phi = np.stack([np.asarray(f) for f in features(*state, scales[place])])
+        own = jax.jit(partial(features, scales=scales[place]))(position, velocity, drive)
+        phi = np.stack([np.asarray(f) for f in own])
         own = weights[k * FEATURES : (k + 1) * FEATURES]
         forces[place] = (scales[place].force * (own @ phi), position, velocity, drive, time)
     return _Residual(found, bench, places, shares_from_left(left), forces)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from bayessim_jax.beliefs.margins import uniform
+from bayessim_jax.beliefs.margins import Margins, uniform
 from bayessim_jax.diagnosis.belief import covariance_of, moments_of_effects, moments_of_theta
 from bayessim_jax.diagnosis.bench import Candidate, margin_of_effect
 from bayessim_jax.effects import EFFECTS, Scales
@@ -22,7 +22,7 @@ class Bench:
     def __init__(self, effect="coulomb_friction"):
         self.parameters = EFFECTS[effect].parameters("joint/hinge", Scales(timestep=0.002, period=0.004))
         self.each = [margin_of_effect(p) for p in self.parameters]
-        self.margins = SimpleNamespace(theta=lambda z: jnp.stack([uniform(0.0, 1.0).value(z[0])]))
+        self.margins = Margins.create(["theta"], [uniform(0.0, 1.0)])
 
     def columns(self, candidate):
         return list(range(len(self.parameters))) if candidate.effects else []

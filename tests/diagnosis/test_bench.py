@@ -14,7 +14,7 @@ from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.effects import EFFECTS, Scales
 from bayessim_jax.inference.direct import estimate_noise
 from bayessim_jax.inference.replay import replay_window
-from bayessim_jax.inference.shooting import solve
+from bayessim_jax.inference.shooting import predict_all, solve
 from bayessim_jax.recordings.loading import load_case
 from bayessim_jax.recordings.shots import case_model
 from benchmarks.worlds import make_case
@@ -81,7 +81,7 @@ def test_the_screen_knows_what_a_sensors_error_changes_in_the_first_state_too(pr
 def predicted(bench, candidate, x):
     shots = bench.setup(candidate)
     still = jnp.zeros((shots.y.shape[0], shots.spread.size))
-    return jax.vmap(bench.predict, in_axes=(None, 0, 0))(x, still, shots.inputs)
+    return predict_all(bench.predict, shots, x, still)
 
 
 def test_no_candidate_is_the_simulator_as_it_is(problem):
@@ -172,7 +172,7 @@ def test_scores_are_those_of_fits_without_the_fold(problem):
         bench.shots = kept
         fit = bench.fit(Candidate(), entry.fit.z, entry.fit.delta, entry.fit.sigma, steps=30)
         sigma = estimate_noise(kept, fit, 0.0 * fit.sigma)
-        shots = dataclasses.replace(left, inputs=bench.setup(Candidate()).inputs)
+        shots = dataclasses.replace(bench.setup(Candidate()), measured=left.measured)
         held = jnp.zeros(bench.size, bool)
         judged = solve(bench.predict, shots, fit.z, entry.fit.delta, sigma, held)
         logs = -0.5 * judged.r**2 - jnp.log(sigma)
