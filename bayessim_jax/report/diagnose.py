@@ -162,8 +162,9 @@ def _map(diagnosis: CaseDiagnosis) -> tuple[str, str, str]:
 
 
 def _candidates(diagnosis: CaseDiagnosis) -> tuple[str, str, str]:
-    svg = candidates_plot(diagnosis.result.screened)
-    return svg, "Gain of every candidate.", "What each candidate gains in log likelihood on the windows that choose."
+    named = {name for entry in diagnosis.result.confusion for name in entry.names}
+    caption = "What each gains by itself in log likelihood on the windows that choose; what is named stands out."
+    return candidates_plot(diagnosis.result.screened, named), "Gain of every candidate.", caption
 
 
 def _entries(diagnosis: CaseDiagnosis) -> str:
@@ -172,7 +173,7 @@ def _entries(diagnosis: CaseDiagnosis) -> str:
     for entry in diagnosis.result.entries:
         named = "yes" if entry in diagnosis.result.confusion else ""
         left = share_left(entry.misfit, base.misfit)
-        shares = (f"{number(100 * share, 2)} %" for share in (left, entry.ahead))
+        shares = (f"{number(100 * share, 2)} %" if np.isfinite(share) else "" for share in (left, entry.ahead))
         rows.append([" + ".join(entry.names), number(entry.score - base.score, 4), *shares, named])
     return html.table(["finalist", "gain on recordings left out", "misfit left", "error ahead left", "named"], rows)
 

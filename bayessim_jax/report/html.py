@@ -36,7 +36,7 @@ figcaption { margin-top: .5rem; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; margin: .6rem 0; }
 th, td { text-align: right; padding: .3rem .8rem .3rem 0; border-bottom: 1px solid var(--line); white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; }
+th:first-child, td:first-child { text-align: left; white-space: normal; min-width: 10rem; }
 th { font-weight: 600; color: var(--soft); }
 pre { background: var(--card); border-radius: .5rem; padding: .8rem 1rem; overflow-x: auto; margin: .3rem 0 .9rem; }
 code { font: .88rem/1.5 ui-monospace, "SF Mono", Menlo, Consolas, monospace; }

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from bayessim_jax.report.style import BLUE, GREY, ORANGE, draw_svg
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
 
     from matplotlib.figure import Figure
 
@@ -55,14 +55,14 @@ def _middles(recording: Sequence[str]) -> list[tuple[float, str]]:
     return [(float(np.mean([k for k, r in enumerate(recording) if r == name])), name) for name in names]
 
 
-def candidates_plot(screened: Sequence[tuple[str, float]]) -> str:
-    """The gains of the best candidates, as bars."""
+def candidates_plot(screened: Sequence[tuple[str, float]], named: Collection[str]) -> str:
+    """The gains of the best candidates, as bars; those that are named stand out."""
     shown = list(screened)[:MOST][::-1]
 
     def draw(figure: Figure) -> None:
         ax = figure.subplots()
         gains = [max(gain, 0.0) for _, gain in shown]
-        colours = [BLUE if k == len(shown) - 1 else ORANGE for k in range(len(shown))]
+        colours = [BLUE if name in named else ORANGE for name, _ in shown]
         ax.barh(range(len(shown)), gains, color=colours, height=0.65)
         ax.set_yticks(range(len(shown)), [name for name, _ in shown])
         ax.set_xlabel("gain in log likelihood [nats]")
