@@ -516,7 +516,7 @@ def _enter(work: _Work, candidate: Candidate, fit: Fit, known: Float[np.ndarray,
     # what a joint's motion has left in an effect when a recording begins is not known
     recalls = any(getattr(bench.pairs[k][0], "recalls", False) for k in candidate.effects)
     judged = work.remembered if recalls else None
-    misfit = judge_misfit(misfit_key, np.asarray(fit.misses), fit.along_states, np.asarray(measured), known, judged)
+    misfit = judge_misfit(misfit_key, fit.misses, fit.along_states, np.asarray(measured), known, judged)
     z, precision = np.asarray(fit.z), np.asarray(fit.precision)
     share = float(-0.5 * z @ z - 0.5 * np.linalg.slogdet(precision)[1])
     return Entry(candidate, bench.names(candidate), fit, scores, misfit, log_share=share, seats=bench.seats(candidate))

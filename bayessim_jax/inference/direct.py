@@ -64,7 +64,7 @@ def estimate_noise(
 ) -> Float[Array, " obs"]:
     """Noise of every channel from what a fit leaves; of z so many are `free`, all unless told (`noise_level`)."""
     counts = np.asarray(shots.measured).sum((0, 1))
-    squares = (np.asarray(fit.misses) ** 2).sum((0, 1))
+    squares = (fit.misses**2).sum((0, 1))
     return noise_level(squares, counts, (fit.z.size if free is None else free) + fit.delta.size, floor, least)
 
 

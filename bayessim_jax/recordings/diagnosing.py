@@ -377,8 +377,7 @@ def _fit_residual_force(key: Array, taken: _Taken, none: Entry) -> _Residual | N
     for k, (place, (_, q, v)) in enumerate(zip(places, joints, strict=True)):
         position, velocity = (np.asarray(x)[rows] for x in (motion.qpos[:, :-1, q], motion.qvel[:, :-1, v]))
         drive = (np.asarray(motion.ctrl) @ gears[:, v])[rows] if motion.ctrl.shape[-1] else np.zeros(rows.sum())
-        own = jax.jit(partial(features, scales=scales[place]))(position, velocity, drive)
-        phi = np.stack([np.asarray(f) for f in own])
+        phi = np.stack(jax.jit(partial(features, scales=scales[place]))(position, velocity, drive))
         own = weights[k * FEATURES : (k + 1) * FEATURES]
         forces[place] = (scales[place].force * (own @ phi), position, velocity, drive, time)
     return _Residual(found, bench, places, shares_from_left(left), forces)

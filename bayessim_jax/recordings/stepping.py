@@ -140,6 +140,6 @@ def _with_runs(shots: Shots, runs: Float[np.ndarray, "windows nodes rows obs"]) 
 def _size(shots: Shots, fit: Fit, error: Float[np.ndarray, "windows rows obs"]) -> tuple[float, int]:
     """An error against the noise, in the channel where it is largest, and the numbers measured."""
     measured = np.asarray(shots.measured)
-    noise = difference_noise(np.nan_to_num(np.asarray(fit.misses)), measured)
+    noise = difference_noise(np.nan_to_num(fit.misses), measured)
     usual = np.sqrt((error**2).sum((0, 1)) / np.maximum(measured.sum((0, 1)), 1))
     return float((usual / np.maximum(noise, np.asarray(noise_floor(shots)))).max()), int(measured.sum())
