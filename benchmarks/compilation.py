@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -9,10 +10,15 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from benchmarks.timing import choose_clock, chosen_clock, now
 
-__all__ = ["Compilation", "fresh_cache", "measure_compilation", "watch_compilation"]
+__all__ = ["Compilation", "fresh_cache", "make_room", "measure_compilation", "watch_compilation"]
+
+MOST_MAPS = 30_000
+"""Maps of memory with which a process may go on; systems allow about 65,000."""
+MOST_BYTES = 4e9
 
 
 class Compilation:
@@ -48,6 +54,17 @@ def watch_compilation() -> Iterator[Compilation]:
         yield watched
     finally:
         jax.monitoring.unregister_event_duration_listener(watched.listen)
+
+
+def make_room() -> None:
+    """Forget compiled programs where a process cannot hold many more of them."""
+    import jax
+
+    here = Path("/proc/self")
+    with contextlib.suppress(OSError):
+        held = int((here / "statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        if held > MOST_BYTES or (here / "maps").read_bytes().count(b"\n") > MOST_MAPS:
+            jax.clear_caches()
 
 
 @contextmanager

@@ -15,6 +15,7 @@ import numpy as np
 
 from bayessim_jax.concealment import LAWS, UNKNOWN, StrengthError
 from bayessim_jax.recordings.concealing import AbsorbedError
+from benchmarks.compilation import make_room
 from benchmarks.worlds import MODELS, RIGS, make_case
 
 if TYPE_CHECKING:
@@ -194,7 +195,7 @@ def resumed(
 
 
 def diagnose_drawn(path: Path, case: dict[str, Any], effects: Sequence[Any] | None = None) -> CaseDiagnosis:
-    """Diagnose a case that was drawn."""
+    """Diagnose a case that was drawn; the next one of the same machine finds what was compiled."""
     from bayessim_jax.recordings.diagnosing import diagnose_case
     from bayessim_jax.recordings.evaluation import BEFORE
     from bayessim_jax.recordings.loading import load_case
@@ -202,7 +203,7 @@ def diagnose_drawn(path: Path, case: dict[str, Any], effects: Sequence[Any] | No
 
     model = case_model(load_case(path).check(), before=BEFORE)
     found = diagnose_case(jax.random.key(case["seed"]), model, effects=effects)
-    jax.clear_caches()
+    make_room()
     return found
 
 

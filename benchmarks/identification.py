@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
-from benchmarks.compilation import fresh_cache, watch_compilation
+from benchmarks.compilation import fresh_cache, make_room, watch_compilation
 from benchmarks.concealed import resumed
 from benchmarks.peers import require_peers
 from benchmarks.timing import stopwatch
@@ -25,6 +26,10 @@ __all__ = ["MODELS", "compare_methods", "draw_clean", "identify_clean", "ranks",
 MODELS = ("pendulum", "slide", "double", "cart", "arm3")
 NOISE = 1.0
 """Times 1e-3 rad or 2e-4 m on positions, and ten times as much for a second on velocities."""
+
+PROGRAMS = ("none", "on disk", "here")
+"""What was compiled before: nothing for a machine's first case, programs in the persistent cache for its second, as for
+a command that is given again, and programs in the same process for the others."""
 
 
 def draw_clean(rigs: list[str], count: int, seed: int, finer: int = 1) -> list[dict[str, Any]]:
@@ -54,14 +59,16 @@ def identify_clean(options: Namespace) -> None:
     if options.out and options.out.exists() and {row["method"] for row in _read(options.out)} - {options.method}:
         raise SystemExit(f"{options.out} holds cases of another method; give another --out.")
     peer: dict[str, Callable[..., Any] | None] = {} if options.method == "direct" else {"identify": None}
-    compiled: set[str] = set()
+    seen: Counter[str] = Counter()
 
     def make(path: Path, case: dict[str, Any]) -> dict[str, Any]:
         if not peer:
             peer["identify"] = _find_peer()
-        first = case["rig"] not in compiled
-        compiled.add(case["rig"])
-        return {"method": options.method, "first": first, **_infer(path, case, options.method, peer["identify"])}
+        seen[case["rig"]] += 1
+        programs = PROGRAMS[min(seen[case["rig"]], len(PROGRAMS)) - 1]
+        if programs == "on disk":
+            jax.clear_caches()
+        return {"method": options.method, "programs": programs, **_infer(path, case, options.method, peer["identify"])}
 
     rows = []
     with fresh_cache():
@@ -107,7 +114,7 @@ def _infer(path: Path, case: dict[str, Any], method: str, peer: Callable[..., An
     model = case_model(load_case(path).check())
     with watch_compilation() as compilation:
         seconds, found = stopwatch(partial(infer_case, method=method), jax.random.key(case["seed"]), model)
-    jax.clear_caches()
+    make_room()
     estimate, peer_seconds = peer(model, found.fitted) if peer else (None, None)
     truths = json.loads((path / SEALED).read_text(encoding="utf-8"))["parameters"]
     draws = np.asarray(found.posterior.draws)
@@ -146,8 +153,8 @@ def _error(row: dict[str, Any], which: str) -> float:
 
 
 HEAD = """\
-| machine | cases | joint 50 % | 90 % | numbers | each 50 % | 90 % | error over the peer's | s | first | again | peer |
-|---|---|---|---|---|---|---|---|---|---|---|---|"""
+| machine | cases | joint 50 % | 90 % | numbers | each 50 % | 90 % | error:peer's | s | cold | on disk | again | peer |
+|---|---|---|---|---|---|---|---|---|---|---|---|---|"""
 
 
 def summarize(rows: list[dict[str, Any]]) -> str:
@@ -155,7 +162,7 @@ def summarize(rows: list[dict[str, Any]]) -> str:
 
     How many joint 50 % and 90 % sets hold θ*, and how many central intervals of single parameters; error over the
     peer's: median and quartiles over cases; seconds, medians: without compilation, with it the first time that a
-    machine is met, with it when programs come from the persistent cache, and the peer's.
+    machine is met, with programs from the persistent cache, with those of the same process, and the peer's.
     """
     rigs = list(dict.fromkeys(row["case"]["rig"] for row in rows))
     lines = [HEAD] + [_line(rig, [row for row in rows if row["case"]["rig"] == rig]) for rig in rigs]
@@ -163,8 +170,8 @@ def summarize(rows: list[dict[str, Any]]) -> str:
 
 
 METHODS_HEAD = """\
-| method | cases | joint 50 % | 90 % | numbers | each 50 % | 90 % | error | sd over {}'s | s | first | again |
-|---|---|---|---|---|---|---|---|---|---|---|---|"""
+| method | cases | joint 50 % | 90 % | numbers | each 50 % | 90 % | error | sd over {}'s | s | cold | on disk | again |
+|---|---|---|---|---|---|---|---|---|---|---|---|---|"""
 
 
 def compare_methods(rows: list[dict[str, Any]], others: list[dict[str, Any]]) -> str:
@@ -201,12 +208,11 @@ def _held(rows: list[dict[str, Any]]) -> tuple[Any, ...]:
     return (*joint, len(below), *each)
 
 
-def _seconds(rows: list[dict[str, Any]]) -> tuple[str, str, str]:
-    """Medians: without compilation, with it the first time, with it from the cache."""
+def _seconds(rows: list[dict[str, Any]]) -> tuple[str, ...]:
+    """Medians: without compilation, and with it for each of `PROGRAMS`."""
     net = np.median([row["ours_seconds"] - row["compile_seconds"] for row in rows])
-    spent = [[row["ours_seconds"] for row in rows if row["first"] == first] for first in (True, False)]
-    first, again = (f"{np.median(each):.1f}" if each else "–" for each in spent)
-    return f"{net:.2f}", first, again
+    spent = [[row["ours_seconds"] for row in rows if row["programs"] == programs] for programs in PROGRAMS]
+    return f"{net:.2f}", *(f"{np.median(each):.1f}" if each else "–" for each in spent)
 
 
 def _line(name: str, rows: list[dict[str, Any]]) -> str:

@@ -1,8 +1,8 @@
-"""The bench on which candidates are tried: one simulator that holds every effect at every place, most of them neutral.
+"""The bench on which candidates are simulated: for each a simulator with its effects in it, and θ fitted with them.
 
-An effect at its neutral parameters changes nothing, bit for bit. So the simulator with all candidates in it is each of
-them in turn, and the one without any: it is traced and compiled once, and a candidate is a choice of which parameters
-are free. θ and the initial states of all windows are refitted with every candidate.
+The initial states of all windows are fitted as well. What a case decides (recordings, ranges of the effects'
+parameters) is an argument of the programs: another case of the same model and effects finds them compiled, whatever
+other candidates there are.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int, Scalar
+from jaxtyping import Array, Bool, Float, Scalar
 
 from bayessim_jax.beliefs.margins import Margin, Margins, log_uniform, uniform
 from bayessim_jax.effects import EffectParameter, Scales, at, with_effects
-from bayessim_jax.effects.wiring import Wired
+from bayessim_jax.effects.attach import wire
 from bayessim_jax.inference.replay import Inputs, Restarted, replay_window
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS, DAMPING, Fit, Shots, predict_all, solve
-from bayessim_jax.systems.mjcf import MjcfSystem
+from bayessim_jax.systems.mjcf import MjcfSystem, system_key
 
 __all__ = ["NEAR", "SLOTS", "Bench", "Candidate", "CandidatesOf", "begin_point", "begin_value", "margin_of_effect"]
 
@@ -73,18 +73,53 @@ class CandidatesOf:
 
 @struct.dataclass
 class Tried:
-    """A window, and which parameters are free in it."""
+    """A window, and the ranges of the effects' parameters."""
 
     window: Inputs
-    index: Int[Array, " k"]
-    """Where the free parameters stand in [θ, effects' parameters, a place for those that are not used]."""
-    on: Bool[Array, " e"]
-    """Which of the effects' parameters are not neutral."""
     low: Float[Array, " e"]
-    """Ranges of the effects' parameters. They are arguments and not constants of the program, because recordings decide
-    them: another case of the same model then finds the program in the compilation cache."""
     high: Float[Array, " e"]
-    neutral: Float[Array, " e"]
+
+
+@dataclass(frozen=True, eq=False)
+class Simulator:
+    """`predict(x, δ, tried)` of a system with some effects, x = [θ's z, the effects' z].
+
+    Two of the same system, priors and effects are equal, so that what was compiled for one serves the other: ranges
+    and scales are no part of the program.
+    """
+
+    system: MjcfSystem | Restarted
+    """Without the effects."""
+    margins: Margins
+    pairs: tuple[tuple[Any, str], ...]
+    scales: Mapping[str, Scales]
+    kinds: tuple[Margin, ...]
+    """Of the effects' parameters; their numbers come with the windows."""
+
+    @cached_property
+    def augmented(self) -> Any:
+        """The system with the effects."""
+        plain: Any = self.system
+        return with_effects(plain, self.pairs, self.scales) if self.pairs else plain
+
+    def __call__(self, x: Float[Array, " k"], delta: Float[Array, " n"], tried: Tried) -> Float[Array, "rows obs"]:
+        """What the sensors show in every row."""
+        d = self.margins.size
+        theta = self.margins.theta(x[:d])
+        if self.kinds:
+            own = [m.between(tried.low[k], tried.high[k]).value(x[d + k]) for k, m in enumerate(self.kinds)]
+            theta = jnp.concatenate([theta, jnp.stack(own)])
+        return replay_window(self.augmented, theta, delta, tried.window)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Simulator) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    @cached_property
+    def _key(self) -> tuple[Any, ...]:
+        return system_key(self.system), self.margins, self.pairs, tuple(m.kind for m in self.kinds)
 
 
 class Bench:
@@ -100,17 +135,13 @@ class Bench:
         step: float = 0.0,
         slots: int = SLOTS,
     ) -> None:
-        self.margins, self.pairs, self.step, self.slots = margins, tuple(pairs), step, slots
-        self.scales = scales
-        plain: Any = system
-        self.union = with_effects(plain, self.pairs, scales) if self.pairs else plain
+        self.system, self.margins, self.pairs = system, margins, tuple(pairs)
+        self.scales, self.shots, self.step, self.slots = scales, shots, step, slots
         self.channels = system.observations.names
-        self.shots = shots
-        self.wired: tuple[Wired, ...] = self.union.effects if self.pairs else ()
+        self.wired = wire(system, self.pairs, scales)
         self.parameters = [p for w in self.wired for p in w.parameters]
         self.first = np.cumsum([0, *(len(w.parameters) for w in self.wired)])
         self.each: list[Margin] = [margin_of_effect(p) for p in self.parameters]
-        self.neutral = np.array([p.neutral for p in self.parameters])
 
     @property
     def d(self) -> int:
@@ -119,8 +150,12 @@ class Bench:
 
     @property
     def size(self) -> int:
-        """Numbers that a fit finds: θ, and as many more as a candidate may have."""
+        """Numbers of a fit: θ's, as many more as a candidate may have, and zeros where it has fewer."""
         return self.d + self.slots
+
+    def used(self, candidate: Candidate) -> int:
+        """Numbers of a fit that a candidate has."""
+        return self.d + len(self.columns(candidate))
 
     def name(self, effect: int) -> str:
         """`coulomb_friction@joint/hinge`."""
@@ -139,29 +174,31 @@ class Bench:
     def seats(self, candidate: Candidate) -> dict[str, str]:
         """Names of a candidate's effects on actuators, and the same at the joint that is driven."""
         found = {}
+        system: Any = self.system
         for k in candidate.effects:
             effect, place = self.pairs[k]
             joint = self.wired[k].site.joint
             if place.startswith("actuator/") and joint >= 0:
-                found[self.name(k)] = f"{effect.name}@joint/{self.union.engine.model.joint(joint).name}"
+                found[self.name(k)] = f"{effect.name}@joint/{system.engine.model.joint(joint).name}"
         return found
 
     def columns(self, candidate: Candidate) -> list[int]:
         """Numbers of a candidate's parameters among those of all effects."""
         return [i for k in candidate.effects for i in range(self.first[k], self.first[k + 1])]
 
+    def simulator(self, candidate: Candidate) -> Simulator:
+        """`predict` of a candidate."""
+        pairs = tuple(self.pairs[k] for k in candidate.effects)
+        kinds = tuple(self.each[i] for i in self.columns(candidate))
+        return Simulator(self.system, self.margins, pairs, self.scales, kinds)
+
     def setup(self, candidate: Candidate, shots: Shots | None = None) -> Shots:
-        """The windows (or others) with a candidate's parameters free."""
+        """The windows (or others) as a candidate's simulator takes them."""
         every = self.shots if shots is None else shots
-        columns = self.columns(candidate)
-        unused = self.d + len(self.parameters)
-        index = np.concatenate([np.arange(self.d), self.d + np.array(columns, int)])
-        index = np.concatenate([index, np.full(self.size - len(index), unused)]).astype(int)
-        on = np.isin(np.arange(len(self.parameters)), columns)
-        ranges = ([m.a for m in self.each], [m.b for m in self.each], self.neutral)
-        inputs = Tried(every.inputs, *map(jax.device_put, (index, on, *(np.asarray(x, float) for x in ranges))))
-        axes: Any = (0, None, None, None, None, None)
-        return dataclasses.replace(every, inputs=inputs, axes=Tried(*axes))
+        own = [self.each[i] for i in self.columns(candidate)]
+        low, high = (jax.device_put(np.array([getattr(m, side) for m in own], float)) for side in "ab")
+        axes: Any = (0, None, None)
+        return dataclasses.replace(every, inputs=Tried(every.inputs, low, high), axes=Tried(*axes))
 
     def starts(self, candidate: Candidate, z: Float[Array, " d"]) -> list[Float[Array, " k"]]:
         """Points to begin from: θ as given, the effects a little off neutral, at their start values, and mirrored."""
@@ -175,22 +212,7 @@ class Bench:
 
     def free(self, candidate: Candidate) -> Bool[Array, " k"]:
         """Which of the numbers that a fit finds are free."""
-        return jax.device_put(np.arange(self.size) < self.d + len(self.columns(candidate)))
-
-    @cached_property
-    def predict(self) -> Any:
-        """`predict(x, δ, tried)`; the same function for every candidate."""
-        d, margins, union, each = self.d, self.margins, self.union, self.each
-
-        def predict(x: Array, delta: Array, tried: Tried) -> Array:
-            z = jnp.zeros(d + len(each) + 1, x.dtype).at[tried.index].set(x)
-            theta = margins.theta(z[:d])
-            if each:
-                own = [m.between(tried.low[k], tried.high[k]).value(z[d + k]) for k, m in enumerate(each)]
-                theta = jnp.concatenate([theta, jnp.where(tried.on, jnp.stack(own), tried.neutral)])
-            return replay_window(union, theta, delta, tried.window)
-
-        return predict
+        return jax.device_put(np.arange(self.size) < self.used(candidate))
 
     def values(self, candidate: Candidate, x: Float[Array, " k"]) -> dict[str, float]:
         """The effects' parameters in physical units, `coulomb_friction@joint/hinge/coulomb`."""
@@ -213,16 +235,18 @@ class Bench:
         damping: float | Scalar = DAMPING,
     ) -> Fit:
         """Fit a candidate from a point."""
-        free, shots = self.free(candidate), self.setup(candidate)
+        used, shots = self.used(candidate), self.setup(candidate)
+        free = jax.device_put(np.ones(used, bool))
         how = {"steps": jnp.asarray(steps), "step": self.step, "damping": jnp.asarray(damping)}
-        return solve(self.predict, shots, x, delta, sigma, free, **how)
+        return solve(self.simulator(candidate), shots, _first(x, used), delta, sigma, free, **how).widen(self.size)
 
     def replay(
         self, candidate: Candidate, x: Float[Array, " k"], shots: Shots, delta: Float[Array, " n"] | float = 0.0
     ) -> Float[np.ndarray, "windows rows obs"]:
         """Predictions of windows from their recorded initial states, or from beside them."""
         still = jnp.broadcast_to(delta, (shots.y.shape[0], shots.spread.size))
-        return np.asarray(_replay(self.predict, self.setup(candidate, shots), x, still))
+        own = self.setup(candidate, shots)
+        return np.asarray(_replay(self.simulator(candidate), own, _first(x, self.used(candidate)), still))
 
     def scatter(
         self,
@@ -235,6 +259,11 @@ class Bench:
         """Variance of predictions `here` where every part of the initial states is off by so much."""
         moved = (self.replay(candidate, x, shots, jnp.asarray(move)) for move in np.diag(start))
         return sum(((y - here) ** 2 for y in moved), np.zeros_like(here))
+
+
+def _first(x: Float[Array, " k"], used: int) -> Float[Array, " d"]:
+    """The numbers that are used, without a program of its own."""
+    return jax.device_put(np.asarray(x)[:used])
 
 
 def margin_of_effect(p: EffectParameter) -> Margin:

@@ -123,8 +123,7 @@ def design(bench: Bench, members: Sequence[Entry], motions: Motions, shots: Shot
     for j, entry in enumerate(members):
         for i, y in enumerate(shown):
             if i != j:
-                own = bench.setup(entry.candidate, dataclasses.replace(blank, y=jnp.asarray(y)))
-                left = _separate(bench.predict, own, entry.fit.z, entry.fit.precision, members[i].fit.sigma, bench.step)
+                left = _separate_from(bench, entry, dataclasses.replace(blank, y=jnp.asarray(y)), members[i].fit.sigma)
                 apart[i, j] = np.where(fine, np.nan_to_num(np.asarray(left)), 0.0)
     pairs = [(i, j) for i in range(len(members)) for j in range(i)]
     between = np.array([np.minimum(apart[i, j], apart[j, i]) for i, j in pairs])
@@ -138,6 +137,13 @@ def design(bench: Bench, members: Sequence[Entry], motions: Motions, shots: Shot
     return Experiment(
         motions.names[k], motions.ctrl[k], motions.qpos[k], motions.qvel[k], dt, pair, float(between[least, k])
     )
+
+
+def _separate_from(bench: Bench, entry: Entry, shots: Shots, sigma: Array) -> Array:
+    """Of every motion, what one member cannot explain of what another one made of it, nats."""
+    used, own = bench.used(entry.candidate), bench.setup(entry.candidate, shots)
+    x, precision = entry.fit.z[:used], entry.fit.precision[:used, :used]
+    return _separate(bench.simulator(entry.candidate), own, x, precision, sigma, bench.step)
 
 
 @partial(jax.jit, static_argnames=("predict", "step"), compiler_options=COMPILER_OPTIONS)

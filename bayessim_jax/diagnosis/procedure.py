@@ -5,10 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
-from itertools import chain, count
+from itertools import count
 from typing import Any, TypeVar
+from zlib import crc32
 
 import jax
 import jax.numpy as jnp
@@ -84,8 +85,8 @@ class _Work:
     say: Callable[[str], None]
     remembered: Bool[np.ndarray, " windows"] | None = None
     """Windows before which as much was recorded as effects remember, unless that is so for few."""
-    numbers: tuple[int, ...] = ()
-    """Of the problem's pairs, those on the bench."""
+    done: dict[Candidate, Entry] = field(default_factory=dict)
+    """What was simulated and fitted already."""
 
     @cached_property
     def folds(self) -> Bool[Array, "folds windows"]:
@@ -94,7 +95,7 @@ class _Work:
 
     def settle(self, candidate: Candidate, fit: Fit) -> Fit:
         """Fit a candidate and its noise in turn."""
-        free = self.bench.d + len(self.bench.columns(candidate))
+        free = self.bench.used(candidate)
         for _ in range(ROUNDS):
             sigma = estimate_noise(self.bench.shots, fit, self.floor, free, LEAST_SHARE)
             change = np.abs(np.log(np.asarray(sigma) / np.asarray(fit.sigma))).max()
@@ -140,7 +141,7 @@ class Problem:
         return Screen(Scene(self.system, self.margins, pairs, self.scales, shots, motion, self.step, slots))
 
     def bench(self, pairs: Sequence[tuple[Any, str]], slots: int = SLOTS) -> Bench:
-        """A bench for some of the pairs."""
+        """A bench for these pairs."""
         return Bench(self.system, self.margins, pairs, self.scales, self.shots, self.step, slots)
 
 
@@ -189,7 +190,7 @@ def name_effects(
     if not ranked:
         return Diagnosis("unexplained", *detect(key, problem, _still(problem, start)), [])
     singles = _finalists(screen, nothing, ranked)
-    work = _bench_of(key, problem, singles, say)
+    work = _begin_work(key, problem, say)
     none = _without(work, problem, detected)
     entries = _finish(work, none, singles, problem.ahead, thresholds)
     left = share_left(entries[0].misfit, none.misfit) if entries else 1.0
@@ -205,12 +206,11 @@ def name_effects(
         pairs = [pair for pair in _pair(key, growth, nothing, ranked)[:PAIRS] if remain(pair) < worth]
         if pairs:
             alone = {k for pair in pairs for k in pair.candidate.effects}
-            best = {work.numbers[k] for entry in entries[:2] for k in entry.candidate.effects}
+            best = {k for entry in entries[:2] for k in entry.candidate.effects}
             kept = [*pairs, *(found for found in ranked if found.candidate.effects[0] in alone | best)]
-            work = _bench_of(key, problem, kept, say)
             entries = _finish(work, none, kept, problem.ahead, thresholds)
             while entries and _is_too_narrow(entries, none, thresholds):
-                leads = [_settled(screen, work, entry, kept) for entry in _widest(work.bench, none, entries)]
+                leads = [_settled(screen, entry, kept) for entry in _widest(work.bench, none, entries)]
                 grown = [(found, known) for known in leads for found in growth.extend(known)]
                 wider = [found for found, known in grown if remain(found) < thresholds.worth * remain(known)]
                 if not wider:
@@ -218,7 +218,6 @@ def name_effects(
                 say(f"{len(leads[0].candidate.effects)} effects are not enough: trying another one")
                 wider = sorted(wider, key=lambda found: -found.score)[:PAIRS]
                 kept = [*wider, *kept]
-                work = _bench_of(key, problem, kept, say)
                 entries = _finish(work, none, kept, problem.ahead, thresholds)
     return decide(work.bench, none, entries, work.group, thresholds, listed)
 
@@ -241,11 +240,10 @@ def _widest(bench: Bench, none: Entry, entries: Sequence[Entry]) -> list[Entry]:
     return _with_room(alike, 1, lambda e: len(bench.columns(e.candidate)), lambda e: e.score - none.score)
 
 
-def _settled(screen: Screen, work: _Work, entry: Entry, kept: Sequence[Screened]) -> Screened:
+def _settled(screen: Screen, entry: Entry, kept: Sequence[Screened]) -> Screened:
     """What was found in simulation, fitted along the motion again."""
-    candidate = Candidate(tuple(work.numbers[k] for k in entry.candidate.effects))
-    known = next(found for found in kept if found.candidate == candidate)
-    return screen.settle(candidate, entry.fit.z, known.delta, entry.fit.sigma) or known
+    known = next(found for found in kept if found.candidate == entry.candidate)
+    return screen.settle(entry.candidate, entry.fit.z, known.delta, entry.fit.sigma) or known
 
 
 class _Growth:
@@ -292,16 +290,13 @@ def _quiet(text: str) -> None:
     """Say nothing."""
 
 
-def _bench_of(key: PRNGKeyArray, problem: Problem, candidates: Sequence[Screened], say: Callable[[str], None]) -> _Work:
-    """A bench with the effects of some candidates."""
-    numbers = sorted({k for found in candidates for k in found.candidate.effects})
-    bench = problem.bench([problem.pairs[k] for k in numbers])
-    say(f"simulating {len(candidates)} candidates; compiling takes a while")
-    inputs = problem.shots.inputs
+def _begin_work(key: PRNGKeyArray, problem: Problem, say: Callable[[str], None]) -> _Work:
+    """The bench on which candidates are simulated, and nothing done."""
+    bench, inputs = problem.bench(problem.pairs), problem.shots.inputs
     memory = inputs.past.shape[1] * problem.system.dt
     remembered = np.asarray(inputs.time) > memory - 0.5 * problem.system.dt
     enough = remembered if remembered.mean() > ENOUGH else None
-    return _Work(key, bench, problem.group, noise_floor(bench.shots), say, enough, tuple(numbers))
+    return _Work(key, bench, problem.group, noise_floor(bench.shots), say, enough)
 
 
 def _each(screens: Sequence[Screen], items: Sequence[T], do: Callable[[Screen, T], R]) -> list[R]:
@@ -441,9 +436,10 @@ def _finish(
 
     The best of those with many parameters that leave something are fitted from their usual values, too: where joints
     stick and slip, what fits along the smoothed motion may be far from what fits in simulation. Rivals of the best are
-    fitted from its numbers: it must not win by a better start.
+    fitted from its numbers: it must not win by a better start. What was fitted before is taken as it was.
     """
-    bench = work.bench
+    bench, before = work.bench, dict(work.done)
+    work.say(f"simulating {sum(c.candidate not in before for c in candidates)} candidates; compiling takes a while")
 
     def enter(own: Candidate, p: Float[Array, " k"], sigma: Array) -> Entry | None:
         fit = bench.fit(own, p, jnp.zeros_like(none.fit.delta), jnp.maximum(sigma, work.floor))
@@ -454,8 +450,7 @@ def _finish(
         return entry
 
     def begin(found: Screened) -> Entry | None:
-        own = Candidate(tuple(work.numbers.index(k) for k in found.candidate.effects))
-        return enter(own, found.p, found.sigma)
+        return before.get(found.candidate) or enter(found.candidate, found.p, found.sigma)
 
     def improve(entry: Entry, points: Sequence[Array], sigma: Array) -> Entry:
         others = (enter(entry.candidate, p, sigma) for p in points)
@@ -469,17 +464,19 @@ def _finish(
 
     entries: list[Entry] = []
     with ThreadPoolExecutor(WORKERS) as pool:
-        # the first by itself: what it compiles is there for the others
-        for entry in chain(map(begin, candidates[:1]), pool.map(begin, candidates[1:])):
+        for entry in pool.map(begin, candidates):
             if entry is not None:
                 entries.append(entry)
-                work.say(f"{' + '.join(entry.names)}: score {entry.score:.1f}")
+                if entry.candidate not in before:
+                    work.say(f"{' + '.join(entry.names)}: score {entry.score:.1f}")
         entries.sort(key=lambda entry: -entry.score)
-        left = [e for e in entries if e.misfit.p_value < FALSE_ALARMS and len(bench.columns(e.candidate)) > SIMPLE]
+        fresh = [e for e in entries if e.candidate not in before]
+        left = [e for e in fresh if e.misfit.p_value < FALSE_ALARMS and len(bench.columns(e.candidate)) > SIMPLE]
         _replace(work, entries, zip(left, pool.map(from_usual, left[:AGAIN]), strict=False))
         best = entries[0] if entries else none
         rivals = [entry for entry in entries if _are_rivals(entry, best, none, thresholds)][:AGAIN]
         _replace(work, entries, zip(rivals, pool.map(partial(from_numbers_of, best), rivals), strict=True))
+    work.done |= {entry.candidate: entry for entry in entries}
     if ahead is not None and entries:
         _look_ahead(bench, none, entries, ahead)
     return entries
@@ -512,7 +509,7 @@ def _enter(work: _Work, candidate: Candidate, fit: Fit, known: Float[np.ndarray,
         fit.r, fit.slopes, measured, fit.z, bench.free(candidate), fit.sigma, work.floor, work.folds, fit.delta / spread
     )
     scores = np.nan_to_num(np.asarray(scores), nan=-1e12)
-    misfit_key = jax.random.fold_in(work.key, sum(2**k for k in candidate.effects) % (2**31))
+    misfit_key = jax.random.fold_in(work.key, crc32(" ".join(map(bench.label, candidate.effects)).encode()))
     # what a joint's motion has left in an effect when a recording begins is not known
     recalls = any(getattr(bench.pairs[k][0], "recalls", False) for k in candidate.effects)
     judged = work.remembered if recalls else None

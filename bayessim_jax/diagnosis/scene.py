@@ -27,7 +27,9 @@ from bayessim_jax.effects.contract import Numbers
 from bayessim_jax.effects.drive import CAUTION, actuators_of, drive_of, read_numbers
 from bayessim_jax.effects.history import split_history
 from bayessim_jax.effects.places import find_site, has_rate
-from bayessim_jax.effects.wiring import edit_model
+from bayessim_jax.effects.wiring import Wired, edit_model
+from bayessim_jax.engines.contract import Engine
+from bayessim_jax.engines.fields import Write
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Curvature, Shots
 from bayessim_jax.systems.mjcf import MjcfSystem, displace
 
@@ -84,6 +86,10 @@ class Scene(CandidatesOf):
         plain: Any = system
         self.edited = with_effects(plain, [self.pairs[k] for k in self.edits], scales) if self.edits else None
         self.engine = self.edited.engine if self.edited else system.engine
+        edits = tuple(self.pairs[k] for k in self.edits)
+        kinds = tuple(m.kind for k in self.edits for m in self.margin[k])
+        wired = self.edited.effects if self.edited else ()
+        self.numbers = _EngineNumbers(self.engine, system.engine.writes, margins, edits, kinds, wired)
         rows = system.substeps
         self.fine = next(s for s in range(min(FINE, rows), 0, -1) if rows % s == 0)
         self.h = system.dt / self.fine
@@ -95,7 +101,6 @@ class Scene(CandidatesOf):
     def twin(self) -> Scene:
         """The same scene for another thread: what is kept from fit to fit is its own, compiled programs are shared."""
         twin = copy.copy(self)
-        twin.numbers = self.numbers
         twin._around, twin._home, twin._kept = {}, None, {}
         return twin
 
@@ -141,27 +146,6 @@ class Scene(CandidatesOf):
         for k, place in self.offsets(candidate):
             found[place] = k in self.edits
         return found
-
-    @cached_property
-    def numbers(self) -> Any:
-        """The engine's θ as a function of [z, x of all model effects, which are on, low, high, neutral]."""
-        if self.edited is None:
-            return self.margins.theta
-        d, wired = self.d, self.edited.effects
-        kinds = [m.kind for k in self.edits for m in self.margin[k]]
-        m = len(kinds)
-        writes, model, margins = self.system.engine.writes, self.edited.engine.model, self.margins
-
-        def numbers(full: Array) -> Array:
-            x, on, low, high, neutral = (full[d + i * m : d + (i + 1) * m] for i in range(5))
-            values = [
-                jnp.where(on[i] > 0.5, Margin(kind, 0.0, 1.0).between(low[i], high[i]).value(x[i]), neutral[i])
-                for i, kind in enumerate(kinds)
-            ]
-            theta = jnp.concatenate([margins.theta(full[:d]), jnp.stack(values)])
-            return edit_model(model, writes, wired, theta, d)
-
-        return numbers
 
     def _full(self, candidate: Candidate, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The argument of `numbers`, and what of it p moves: θ, and the rest where the candidate edits the model."""
@@ -328,6 +312,46 @@ class Scene(CandidatesOf):
                 self.system, self.margins, place, driving, self.fine, around.p[: self.d], around.motion, around.lin
             )
         return around.kept[key]
+
+
+@dataclass(frozen=True, eq=False)
+class _EngineNumbers:
+    """The engine's θ as a function of [z, x of all model effects, which are on, low, high, neutral].
+
+    Two of the same engine, priors and effects are equal, whatever the ranges of the effects' parameters.
+    """
+
+    engine: Engine[Any]
+    writes: tuple[Write, ...]
+    """Of the engine without effects."""
+    margins: Margins
+    edits: tuple[tuple[Any, str], ...]
+    kinds: tuple[str, ...]
+    """Of the margins of the effects' parameters."""
+    wired: tuple[Wired, ...]
+
+    def __call__(self, full: Float[Array, " m"]) -> Float[Array, " e"]:
+        """What the engine is stepped with."""
+        d, m = self.margins.size, len(self.kinds)
+        if not m:
+            return self.margins.theta(full)
+        x, on, low, high, neutral = (full[d + i * m : d + (i + 1) * m] for i in range(5))
+        values = [
+            jnp.where(on[i] > 0.5, Margin(kind, 0.0, 1.0).between(low[i], high[i]).value(x[i]), neutral[i])
+            for i, kind in enumerate(self.kinds)
+        ]
+        theta = jnp.concatenate([self.margins.theta(full[:d]), jnp.stack(values)])
+        return edit_model(self.engine.model, self.writes, self.wired, theta, d)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _EngineNumbers) and other._key == self._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    @property
+    def _key(self) -> tuple[Any, ...]:
+        return self.engine, self.writes, self.margins, self.edits, self.kinds
 
 
 def _device(x: np.ndarray) -> Array:

@@ -1,24 +1,45 @@
 """A bench in the place of a scene: systems without a model have no motion to linearize, and are simulated at once.
 
 A registered system takes few effects and its simulation costs little, so that what `diagnosis.screen` does along the
-recorded motion is done here by simulating.
+recorded motion is done here by simulating. One simulator holds every effect at every place, most of them neutral: an
+effect at its neutral parameters changes nothing, bit for bit, so that this simulator is each of the candidates in turn.
+It is compiled once, where a simulator for every candidate would be compiled for each of very many.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
 
 from bayessim_jax.beliefs.margins import Margin
 from bayessim_jax.diagnosis.bench import Bench, Candidate, CandidatesOf
+from bayessim_jax.effects import with_effects
 from bayessim_jax.effects.commanded import EVERY
+from bayessim_jax.inference.replay import Inputs, replay_window
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Curvature, Shots, expand, normal_equations
 
 __all__ = ["SimulatedScene"]
+
+
+@struct.dataclass
+class Chosen:
+    """A window, and which parameters are free in it."""
+
+    window: Inputs
+    index: Int[Array, " k"]
+    """Where the free parameters stand in [θ, effects' parameters, a place for those that are not used]."""
+    on: Bool[Array, " e"]
+    """Which of the effects' parameters are not neutral."""
+    low: Float[Array, " e"]
+    """Ranges of the effects' parameters."""
+    high: Float[Array, " e"]
+    neutral: Float[Array, " e"]
 
 
 class SimulatedScene(CandidatesOf):
@@ -32,10 +53,11 @@ class SimulatedScene(CandidatesOf):
         self.margin: list[list[Margin]] = [[bench.each[i] for i in columns] for columns in own]
         self.sites = [w.site for w in bench.wired]
         self._shots: dict[Candidate, Shots] = {}
+        self.predict = _predict_chosen(bench)
 
     def twin(self) -> SimulatedScene:
         """The same for another thread."""
-        return SimulatedScene(self.bench)
+        return self
 
     def takes(self, candidate: Candidate) -> bool:
         """Whether it can be tried: not an effect of all actuators and of one, nor with too many parameters."""
@@ -59,8 +81,19 @@ class SimulatedScene(CandidatesOf):
     ) -> tuple[Curvature, Float[Array, "windows rows obs"], Float[Array, "windows kn rowsobs"]]:
         """Normal equations at a point, residuals over σ, and derivatives of what is predicted over σ."""
         if candidate not in self._shots:
-            self._shots[candidate] = self.bench.setup(candidate)
-        return _assess(self.bench.predict, self._shots[candidate], jnp.asarray(p), delta, sigma)
+            self._shots[candidate] = self.setup(candidate)
+        return _assess(self.predict, self._shots[candidate], jnp.asarray(p), delta, sigma)
+
+    def setup(self, candidate: Candidate) -> Shots:
+        """The windows with a candidate's parameters free."""
+        bench, columns = self.bench, self.bench.columns(candidate)
+        index = np.full(bench.size, self.d + len(bench.parameters))
+        index[: bench.used(candidate)] = [*range(self.d), *(self.d + i for i in columns)]
+        on = np.isin(np.arange(len(bench.parameters)), columns)
+        ranges = ([m.a for m in bench.each], [m.b for m in bench.each], [p.neutral for p in bench.parameters])
+        given = (jax.device_put(x) for x in (index, on, *(np.asarray(x, float) for x in ranges)))
+        axes: Any = (0, None, None, None, None, None)
+        return dataclasses.replace(self.shots, inputs=Chosen(self.shots.inputs, *given), axes=Chosen(*axes))
 
     def states(self, delta: Float[Array, "windows n"]) -> list[Float[Array, "windows n"]]:
         """Initial states to begin from: those of a fit, and the recorded ones, which no misfit has moved."""
@@ -68,6 +101,23 @@ class SimulatedScene(CandidatesOf):
 
     def begin_around(self, p: Float[Array, " k"]) -> None:
         """Nothing is kept from fit to fit."""
+
+
+def _predict_chosen(bench: Bench) -> Any:
+    """`predict(x, δ, chosen)` of all effects at once; the same function for every candidate."""
+    d, margins, each, system = bench.d, bench.margins, bench.each, bench.system
+    plain: Any = system
+    union = with_effects(plain, bench.pairs, bench.scales) if bench.pairs else plain
+
+    def predict(x: Array, delta: Array, chosen: Chosen) -> Array:
+        z = jnp.zeros(d + len(each) + 1, x.dtype).at[chosen.index].set(x)
+        theta = margins.theta(z[:d])
+        if each:
+            own = [m.between(chosen.low[k], chosen.high[k]).value(z[d + k]) for k, m in enumerate(each)]
+            theta = jnp.concatenate([theta, jnp.where(chosen.on, jnp.stack(own), chosen.neutral)])
+        return replay_window(union, theta, delta, chosen.window)
+
+    return predict
 
 
 def _assess_impl(predict: Any, shots: Shots, p: Array, delta: Array, sigma: Array) -> tuple[Curvature, Array, Array]:

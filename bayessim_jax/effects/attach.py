@@ -16,7 +16,7 @@ from bayessim_jax.effects.commanded import EVERY, AugmentedSystem, find_commands
 from bayessim_jax.effects.contract import Scales
 from bayessim_jax.effects.drive import least_share
 from bayessim_jax.effects.places import Site, find_site
-from bayessim_jax.effects.wiring import assign, extend_box, extend_writes
+from bayessim_jax.effects.wiring import Wired, assign, extend_box, extend_writes
 from bayessim_jax.engines.choice import choose_engine
 from bayessim_jax.engines.contract import Engine
 from bayessim_jax.engines.fields import Write
@@ -24,7 +24,7 @@ from bayessim_jax.engines.tree import TreeEngine
 from bayessim_jax.systems.channels import observed_sensors
 from bayessim_jax.systems.mjcf import MjcfSystem
 
-__all__ = ["effect_places", "with_effects"]
+__all__ = ["effect_places", "wire", "with_effects"]
 
 
 def effect_places(effect: Any, system: System[Any]) -> list[str]:
@@ -58,10 +58,18 @@ def with_effects(
             or getattr(effect, "remembers", False)
         ):
             raise ValueError(f"{effect.name}@{place}: only a system made of a MuJoCo model takes this effect.")
+    wired = wire(system, effects, scales)
+    return AugmentedSystem(extend_box(system.parameters, wired), system, wired)
+
+
+def wire(system: Any, effects: Sequence[tuple[Any, str]], scales: Scales | Mapping[str, Scales]) -> tuple[Wired, ...]:
+    """Where effects act in a system, and their parameters in θ'."""
+    if isinstance(system, MjcfSystem):
+        sites = [find_site(system.engine.model, place) for _, place in effects]
+        return assign(effects, sites, scales, system.parameters.size)
     sites = [find_commands(system, p) if e.port == "act" else _observed(system, p) for e, p in effects]
     spread = [(Alike(e) if p == EVERY else e, p) for e, p in effects]
-    wired = assign(spread, sites, scales, system.parameters.size)
-    return AugmentedSystem(extend_box(system.parameters, wired), system, wired)
+    return assign(spread, sites, scales, system.parameters.size)
 
 
 def _actuators(effect: Any, names: Sequence[str]) -> list[str]:
@@ -74,8 +82,7 @@ def _augment(
     system: MjcfSystem, effects: Sequence[tuple[Any, str]], scales: Scales | Mapping[str, Scales]
 ) -> AugmentedMjcf:
     model, size = system.engine.model, system.parameters.size
-    sites = [find_site(model, place) for _, place in effects]
-    wired = assign(effects, sites, scales, size)
+    wired = wire(system, effects, scales)
     seen = {c.name for c in system.channels}
     for w in wired:
         if w.effect.port == "sense" and w.place not in seen:

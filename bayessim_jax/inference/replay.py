@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -14,7 +15,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from bayessim_jax.beliefs.margins import Margins
 from bayessim_jax.contracts import Box, Discrete
 from bayessim_jax.effects.commanded import AugmentedSystem
-from bayessim_jax.systems.mjcf import MjcfSystem, displace
+from bayessim_jax.systems.mjcf import MjcfSystem, displace, system_key
 
 __all__ = ["Inputs", "Replay", "Restarted", "replay_window"]
 
@@ -154,7 +155,11 @@ class Replay:
         return replay_window(self.system, self.margins.theta(z), delta, window)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Replay) and other.system is self.system and other.margins == self.margins
+        return isinstance(other, Replay) and other._key == self._key
 
     def __hash__(self) -> int:
-        return hash((id(self.system), self.margins))
+        return hash(self._key)
+
+    @cached_property
+    def _key(self) -> tuple[Any, ...]:
+        return system_key(self.system), self.margins

@@ -136,6 +136,24 @@ class Fit:
             slopes=jnp.asarray(np.delete(slopes, np.s_[d : len(precision)], axis=1)),
         )
 
+    def widen(self, size: int) -> Fit:
+        """The same fit with more of z, which stay at zero and change nothing."""
+        d, (windows, _, k) = self.z.size, self.slopes.shape
+        more = size - d
+        if not more:
+            return self
+        slopes, precision = np.asarray(self.slopes), np.eye(size)
+        precision[:d, :d] = self.precision
+        return dataclasses.replace(
+            self,
+            z=jax.device_put(np.pad(np.asarray(self.z), (0, more))),
+            precision=jax.device_put(precision.astype(slopes.dtype)),
+            pulls=jax.device_put(np.pad(np.asarray(self.pulls), ((0, 0), (0, more)))),
+            slopes=jax.device_put(
+                np.concatenate([slopes[:, :d], np.zeros((windows, more, k), slopes.dtype), slopes[:, d:]], axis=1)
+            ),
+        )
+
     @property
     def along_states(self) -> Float[np.ndarray, "windows n k"]:
         """Derivatives of predictions along δ/S, in the channels' units."""

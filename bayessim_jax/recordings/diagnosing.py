@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import jax
@@ -18,7 +17,7 @@ from bayessim_jax.diagnosis.absorbed import find_absorbed
 from bayessim_jax.diagnosis.belief import moments_of_effects, moments_of_theta
 from bayessim_jax.diagnosis.bench import Bench, Candidate
 from bayessim_jax.diagnosis.experiment import Experiment
-from bayessim_jax.diagnosis.flexible import FEATURES, FlexibleForce, features
+from bayessim_jax.diagnosis.flexible import FEATURES, FLEXIBLE, UNITS, features
 from bayessim_jax.diagnosis.locate import Location, find_regime, find_windows_of, shares_from_left
 from bayessim_jax.diagnosis.procedure import Problem, detect, is_mismatch, name_effects
 from bayessim_jax.diagnosis.response import Motion
@@ -357,8 +356,8 @@ def _fit_residual_force(key: Array, taken: _Taken, none: Entry) -> _Residual | N
         return None
     places = [f"joint/{name}" for name, _, _ in joints]
     scales = {p: problem.scales[p] for p in places}
-    pairs = [(FlexibleForce(p, scales[p]), p) for p in places]
-    slots = FEATURES * len(places)
+    pairs = [(FLEXIBLE, place) for place in places]
+    slots = (FEATURES + len(UNITS)) * len(places)
     screen = problem.screen(pairs, slots)
     nothing = screen.begin(none.fit.z[: screen.d], none.fit.sigma)
     every = Candidate(tuple(range(len(pairs))))
@@ -370,17 +369,20 @@ def _fit_residual_force(key: Array, taken: _Taken, none: Entry) -> _Residual | N
         alone = screen.settle(Candidate((k,)), nothing.p, nothing.delta, nothing.sigma, iterations=LONG)
         left.append(1.0 if alone is None else share_left(screen.misfit(key, alone), before))
     bench = problem.bench(pairs, slots)
-    weights = bench.each[0].value(np.asarray(found.p)[bench.d :])
+    weights = bench.each[0].value(np.asarray(found.p)[bench.d :].reshape(len(places), -1)[:, :FEATURES])
     gears, forces = _gears(model), {}
     rows = taken.pieces.valid
     time = (taken.pieces.start[:, None] + taken.pieces.time[:, :-1])[rows]
     for k, (place, (_, q, v)) in enumerate(zip(places, joints, strict=True)):
         position, velocity = (np.asarray(x)[rows] for x in (motion.qpos[:, :-1, q], motion.qvel[:, :-1, v]))
         drive = (np.asarray(motion.ctrl) @ gears[:, v])[rows] if motion.ctrl.shape[-1] else np.zeros(rows.sum())
-        phi = np.stack(jax.jit(partial(features, scales=scales[place]))(position, velocity, drive))
-        own = weights[k * FEATURES : (k + 1) * FEATURES]
-        forces[place] = (scales[place].force * (own @ phi), position, velocity, drive, time)
+        units = {name: getattr(scales[place], name) for name in UNITS}
+        phi = np.stack(_features(position, velocity, drive, units))
+        forces[place] = (scales[place].force * (weights[k] @ phi), position, velocity, drive, time)
     return _Residual(found, bench, places, shares_from_left(left), forces)
+
+
+_features = jax.jit(features)
 
 
 def _gears(model: CaseModel) -> Float[np.ndarray, "nu nv"]:

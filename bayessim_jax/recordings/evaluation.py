@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bayessim_jax.diagnosis.flexible import FlexibleForce
+from bayessim_jax.diagnosis.flexible import FLEXIBLE
 from bayessim_jax.effects import Scales, lookup_effect, with_effects
 from bayessim_jax.inference.replay import replay_window
 from bayessim_jax.inference.scores import compare, score
@@ -29,7 +29,6 @@ from bayessim_jax.recordings.wording import CaseError
 __all__ = ["STATE", "evaluate_run", "read_table", "simulator_of", "write_state"]
 
 STATE = "simulators.json"
-FLEXIBLE = "flexible_force"
 
 
 def write_state(folder: RunFolder, diagnosis: CaseDiagnosis) -> None:
@@ -65,16 +64,23 @@ def write_state(folder: RunFolder, diagnosis: CaseDiagnosis) -> None:
 
 
 def simulator_of(model: CaseModel, state: dict[str, Any], name: str) -> tuple[Any, Any]:
-    """One of a diagnosis' simulators and the θ' that it is run with; raises `ValueError` for an effect unknown here."""
+    """One of a diagnosis' simulators and the θ' that it is run with.
+
+    Raises `ValueError` for an effect unknown here, and for numbers that another version wrote.
+    """
     entry = state["simulators"][name]
     scales = {place: Scales(**table) for place, table in state["scales"].items()}
     pairs = [
-        (FlexibleForce(place, scales[place]) if effect == FLEXIBLE else lookup_effect(effect), place)
-        for effect, place in entry["effects"]
+        (FLEXIBLE if effect == FLEXIBLE.name else lookup_effect(effect), place) for effect, place in entry["effects"]
     ]
     plain: Any = model.system
     system = with_effects(plain, pairs, scales) if pairs else plain
-    return system, jnp.asarray([*entry["theta"], *entry["values"]], float)
+    theta = [*entry["theta"], *entry["values"]]
+    if len(theta) != system.parameters.size:
+        raise ValueError(
+            f"the {name} simulator takes {system.parameters.size} numbers, not {len(theta)}; diagnose anew."
+        )
+    return system, jnp.asarray(theta, float)
 
 
 def evaluate_run(run: RunFolder, pattern: str) -> dict[str, Any]:

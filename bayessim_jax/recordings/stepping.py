@@ -52,11 +52,26 @@ RATIO = normal(1 / 3, 1 / 3)
 
 
 @struct.dataclass
-class Stepped:
+class Seen:
     """A window, and predictions with several time steps less the one that is simulated."""
 
     window: Inputs
     runs: Float[Array, "nodes rows obs"]
+
+
+@dataclass(frozen=True)
+class Stepped:
+    """Predictions with the time step of what was recorded, the last of z."""
+
+    predict: Predict
+    """With the simulation's own."""
+    nodes: tuple[float, ...]
+    """What the time steps of the runs are, of the model's own."""
+
+    def __call__(self, z: Float[Array, " d"], delta: Float[Array, " n"], seen: Seen) -> Float[Array, "rows obs"]:
+        """What the sensors show in every row."""
+        beside = jnp.tensordot(lagrange(self.nodes, RATIO.value(z[-1])), seen.runs, 1)
+        return self.predict(z[:-1], delta, seen.window) + beside
 
 
 @dataclass(frozen=True)
@@ -86,7 +101,7 @@ def settle_step(
     margins = model.margins + Margins.create(["time step"], [RATIO])
     shots = model.shots(windows)
     nodes = (1.0, 1 / REFINED)
-    predict = _stepped(predictor(model), nodes)
+    predict = Stepped(predictor(model), nodes)
     first = _with_runs(shots, np.zeros((len(shots.y), len(nodes), *shots.y.shape[1:])))
     fit = fit_direct(key, predict, first, margins.size, step=model.step, say=say)
     if isinstance(model.system, Restarted):
@@ -113,7 +128,7 @@ def settle_step(
     if size > TOLERABLE and not model.step:
         finest = case_model(model.case, engine=model.engine_name, before=model.before, refined=REFINED**2)
         wide = StepError((model, finer, finest), fit.z[:-1])
-        again = refit(finer, _stepped(predictor(finer), wide.nodes), wide, wide.runs(shots, REFINED, fit.delta))
+        again = refit(finer, Stepped(predictor(finer), wide.nodes), wide, wide.runs(shots, REFINED, fit.delta))
         if float((np.log(np.asarray(fit.sigma) / np.asarray(again.fit.sigma))).mean()) > -0.01:
             h = model.system.dt / model.system.substeps
             times = f"the integration error is {size:.1f} times the noise"
@@ -124,17 +139,8 @@ def settle_step(
     return refit(model, predict, error, runs)
 
 
-def _stepped(predict: Predict, nodes: tuple[float, ...]) -> Predict:
-    """Predictions with the time step of what was recorded."""
-
-    def stepped(z: Array, delta: Array, seen: Stepped) -> Array:
-        return predict(z[:-1], delta, seen.window) + jnp.tensordot(lagrange(nodes, RATIO.value(z[-1])), seen.runs, 1)
-
-    return stepped
-
-
 def _with_runs(shots: Shots, runs: Float[np.ndarray, "windows nodes rows obs"]) -> Shots:
-    return dataclasses.replace(shots, inputs=Stepped(shots.inputs, jnp.asarray(runs)))
+    return dataclasses.replace(shots, inputs=Seen(shots.inputs, jnp.asarray(runs)))
 
 
 def _size(shots: Shots, fit: Fit, error: Float[np.ndarray, "windows rows obs"]) -> tuple[float, int]:

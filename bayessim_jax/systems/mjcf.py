@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from bayessim_jax.engines.contract import Engine
 from bayessim_jax.engines.fields import find_writes, merge_writes
 from bayessim_jax.systems.channels import Channel, find_channels, observed_sensors, state_columns
 
-__all__ = ["MjcfState", "MjcfSystem", "Unknown", "mjcf_system"]
+__all__ = ["MjcfState", "MjcfSystem", "Unknown", "mjcf_system", "system_key"]
 
 
 @dataclass(frozen=True)
@@ -115,6 +115,17 @@ class MjcfSystem:
     def velocities(self, state: MjcfState) -> Float[Array, " nv"]:
         """`qvel`."""
         return self.engine.qvel(state.physics)
+
+
+def system_key(system: Any) -> Hashable:
+    """What is equal for systems that are the same: their numbers and what they are made of.
+
+    Engines with a state of their own, and systems that are no pytree, are only the same as themselves.
+    """
+    leaves, structure = jax.tree.flatten(system)
+    numbers = (jax.Array, np.ndarray, float, int)
+    known = ((np.asarray(x).dtype.str, np.shape(x), np.asarray(x).tobytes()) for x in leaves if isinstance(x, numbers))
+    return structure, tuple(known), tuple(id(x) for x in leaves if not isinstance(x, numbers))
 
 
 def mjcf_system(

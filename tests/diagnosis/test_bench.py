@@ -1,4 +1,4 @@
-"""One simulator that holds every effect: neutral, it is the simulator without them."""
+"""Candidates simulated: their numbers, their fits, and what one of them begins from."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -81,7 +81,7 @@ def test_the_screen_knows_what_a_sensors_error_changes_in_the_first_state_too(pr
 def predicted(bench, candidate, x):
     shots = bench.setup(candidate)
     still = jnp.zeros((shots.y.shape[0], shots.spread.size))
-    return predict_all(bench.predict, shots, x, still)
+    return predict_all(bench.simulator(candidate), shots, x[: bench.used(candidate)], still)
 
 
 def test_no_candidate_is_the_simulator_as_it_is(problem):
@@ -173,8 +173,8 @@ def test_scores_are_those_of_fits_without_the_fold(problem):
         fit = bench.fit(Candidate(), entry.fit.z, entry.fit.delta, entry.fit.sigma, steps=30)
         sigma = estimate_noise(kept, fit, 0.0 * fit.sigma)
         shots = dataclasses.replace(bench.setup(Candidate()), measured=left.measured)
-        held = jnp.zeros(bench.size, bool)
-        judged = solve(bench.predict, shots, fit.z, entry.fit.delta, sigma, held)
+        held = jnp.zeros(bench.d, bool)
+        judged = solve(bench.simulator(Candidate()), shots, fit.z[: bench.d], entry.fit.delta, sigma, held)
         logs = -0.5 * judged.r**2 - jnp.log(sigma)
         exact += np.where(out, np.where(left.measured, logs, 0.0).sum((1, 2)), 0.0)
     np.testing.assert_allclose(entry.scores, exact, rtol=0.02)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
@@ -33,7 +35,11 @@ class TreeState:
 
 @dataclass(eq=False)
 class TreeEngine:
-    """Forward dynamics over the fixed topology of a model; zeros and ones of the model never reach the compiler."""
+    """Forward dynamics over the fixed topology of a model; zeros and ones of the model never reach the compiler.
+
+    Engines of the same model and writes are equal, so that what was compiled for one serves the other; the model must
+    not be changed afterwards.
+    """
 
     model: mujoco.MjModel
     writes: tuple[Write, ...] = ()
@@ -43,6 +49,18 @@ class TreeEngine:
         refusals = find_refusals(self.model, self.writes)
         if refusals:
             raise ValueError(f"the tree engine does not take this model: {'; '.join(refusals)}.")
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, TreeEngine) and other._key == self._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    @cached_property
+    def _key(self) -> tuple[bytes, tuple[Write, ...]]:
+        saved = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
+        mujoco.mj_saveModel(self.model, None, saved)
+        return saved.tobytes(), self.writes
 
     def init(self, theta: Float[Array, " d"], qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]) -> TreeState:
         """The state with these positions and velocities."""
