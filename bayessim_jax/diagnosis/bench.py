@@ -237,8 +237,9 @@ class Bench:
         """Fit a candidate from a point."""
         used, shots = self.used(candidate), self.setup(candidate)
         free = jax.device_put(np.ones(used, bool))
-        how = {"steps": jnp.asarray(steps), "step": self.step, "damping": jnp.asarray(damping)}
-        return solve(self.simulator(candidate), shots, _first(x, used), delta, sigma, free, **how).widen(self.size)
+        start = (_first(x, used), delta, sigma, free)
+        fit = solve(self.simulator(candidate), shots, *start, steps=steps, step=self.step, damping=damping)
+        return fit.widen(self.size)
 
     def replay(
         self, candidate: Candidate, x: Float[Array, " k"], shots: Shots, delta: Float[Array, " n"] | float = 0.0

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from bayessim_jax.contracts import Scalar
 from bayessim_jax.engines.batch import TASKS, WIDE
@@ -234,16 +234,119 @@ COMPILER_OPTIONS = {"xla_cpu_use_fusion_emitters": False, "xla_disable_hlo_passe
 step is cut up for a pool of threads."""
 
 
-@partial(jax.jit, static_argnames=("predict", "step"), compiler_options=COMPILER_OPTIONS)
+@struct.dataclass
+class _March:
+    """Where Levenberg and Marquardt's method stands: a point that is tried, and the best one so far."""
+
+    tried: tuple[Float[Array, " d"], Float[Array, "windows n"]]
+    kept: tuple[Float[Array, " d"], Float[Array, "windows n"]]
+    seen: tuple[Float[Array, "windows k"], Float[Array, "windows dn k"]]
+    """Residuals and slopes at the best one."""
+    here: Curvature
+    damping: Scalar
+    promised: Scalar
+    """By how much the cost should fall from the best one to the one that is tried."""
+    count: Int[Array, ""]
+    small: Int[Array, ""]
+    """Accepted steps in a row that lowered the cost by next to nothing."""
+
+
+@struct.dataclass
+class _Terms:
+    """What a fit is held by beside the recordings, and what it may change."""
+
+    free: Bool[Array, " d"]
+    center: Float[Array, " d"] | float
+    shift: Float[Array, "windows n"] | float
+    spread: Float[Array, " n"]
+    tolerance: float
+
+
+def _set_out(z: Array, delta: Array, rest: int, damping: float | Scalar) -> _March:
+    """Before anything is simulated, of NumPy's numbers."""
+    kind, d, (windows, n) = z.dtype, z.size, delta.shape
+    zeros: Any = partial(np.zeros, dtype=kind)
+    nothing = Curvature(
+        cost=zeros(()) + np.inf,
+        hessian=zeros((d, d)),
+        gradient=zeros(d),
+        own=zeros((windows, n, n)),
+        cross=zeros((windows, n, d)),
+        own_gradient=zeros((windows, n)),
+        pulls=zeros((windows, d)),
+    )
+    seen = (zeros((windows, rest)), zeros((windows, d + n, rest)))
+    none: Any = np.zeros((), int)
+    return _March((z, delta), (z, delta), seen, nothing, jnp.asarray(damping, kind), zeros(()), none, none)
+
+
+def _advance(march: _March, seen: tuple[Array, Array], terms: _Terms) -> _March:
+    """One step, after the point that is tried has been simulated."""
+    tried, here, damping = march.tried, march.here, march.damping
+    there = normal_equations(*seen, tried[0] - terms.center, (tried[1] - terms.shift) / terms.spread)
+    sound = jnp.isfinite(there.cost) & jnp.isfinite(there.gradient).all() & jnp.isfinite(there.hessian).all()
+    better = sound & (there.cost <= here.cost)
+    gain = jnp.where(better, (here.cost - there.cost) / jnp.maximum(jnp.abs(here.cost), 1e-12), 1.0)
+    gain = jnp.where(jnp.isfinite(gain), gain, 1.0)
+    fulfilled = (here.cost - there.cost) / jnp.maximum(march.promised, 1e-300)
+    eased = jnp.where(fulfilled > 0.75, damping / 5, jnp.where(fulfilled > 0.25, damping, damping * 2))
+    damping = jnp.where(better, jnp.maximum(eased, 1e-9), damping * 8).astype(march.damping.dtype)
+    small = jnp.where(better & (gain < terms.tolerance), march.small + 1, jnp.where(better, 0, march.small))
+    best = (march.kept, march.seen, here)
+    kept, seen, here = jax.tree.map(lambda x, y: jnp.where(better, x, y), (tried, seen, there), best)
+    tried, promised = _propose(kept, here, damping, terms)
+    return _March(tried, kept, seen, here, damping, promised, march.count + 1, small)
+
+
+def _propose(
+    at: tuple[Array, Array], here: Curvature, damping: Array, terms: _Terms
+) -> tuple[tuple[Array, Array], Array]:
+    """Where a step leads, and by how much the cost should fall."""
+    free = terms.free
+    precision, gradient, toward, shift = eliminate(here, damping)
+    precision = jnp.where(jnp.outer(free, free), precision, jnp.eye(free.size))
+    precision = precision + damping * jnp.diag(jnp.diagonal(here.hessian))
+    move = jnp.where(free, jnp.linalg.solve(precision, jnp.where(free, gradient, 0.0)), 0.0)
+    move = move * jnp.minimum(1.0, 2.0 / jnp.maximum(jnp.abs(move).max(initial=0.0), 1e-12))
+    moves = shift - toward @ move
+    stiff = move**2 @ jnp.diagonal(here.hessian) + (moves**2 * jnp.diagonal(here.own, axis1=-2, axis2=-1)).sum()
+    promised = 0.5 * (move @ here.gradient + (moves * here.own_gradient).sum() + damping * stiff)
+    return (at[0] + move, at[1] + moves * terms.spread), promised
+
+
+def _arrive(march: _March, sigma: Array, terms: _Terms, shape: tuple[int, ...]) -> Fit:
+    """The best point as a fit."""
+    (z, delta), (r, slopes), here, free = march.kept, march.seen, march.here, terms.free
+    precision, _, _, shift = eliminate(here)
+    return Fit(
+        z=z,
+        delta=delta,
+        sigma=sigma,
+        precision=jnp.where(jnp.outer(free, free), precision, jnp.eye(free.size)),
+        pulls=jnp.where(free, here.pulls - jnp.einsum("wni,wn->wi", here.cross, shift), 0.0),
+        r=r.reshape(shape),
+        slopes=slopes,
+        cost=here.cost,
+        steps=march.count,
+        converged=(march.small >= 2) | (march.damping >= 1e9),
+        damping=march.damping,
+    )
+
+
+_look = jax.jit(expand, static_argnames=("predict", "step"), compiler_options=COMPILER_OPTIONS)
+_go_on = jax.jit(_advance, compiler_options=COMPILER_OPTIONS)
+_end = jax.jit(_arrive, static_argnames="shape", compiler_options=COMPILER_OPTIONS)
+
+
 def solve(
     predict: Predict,
     shots: Shots,
-    z: Float[Array, " d"],
-    delta: Float[Array, "windows n"],
-    sigma: Float[Array, " obs"],
-    free: Bool[Array, " d"],
+    z: Float[ArrayLike, " d"],
+    delta: Float[ArrayLike, "windows n"],
+    sigma: Float[ArrayLike, " obs"],
+    free: Bool[ArrayLike, " d"],
     *,
-    steps: int | Int[Array, ""] = 30,
+    steps: int = 30,
     step: float = 0.0,
     damping: float | Scalar = DAMPING,
 ) -> Fit:
@@ -253,74 +356,22 @@ def solve(
     cost falls by less than a quarter of what the slopes promise, the next one is shorter, too. `damping` is where that
     begins. The solver has converged when two accepted steps in a row lower the cost by less than 1e-7 of it (1e-4 where
     derivatives are differences, as where bodies collide), or when no step does.
+
+    Only the simulation and its derivatives are compiled for a `predict`; the algebra is compiled once for all of the
+    same size.
     """
     kind = jnp.result_type(z)
-    z, delta, sigma = z.astype(kind), delta.astype(kind), sigma.astype(kind)
-
-    d, n, windows = z.size, delta.shape[-1], delta.shape[0]
-    tolerance = ROUGH if step else TOLERANCE
-    held = jnp.outer(free, free)
-    zero = jnp.zeros((), kind)
-    nothing = Curvature(
-        cost=zero + jnp.inf,
-        hessian=jnp.zeros((d, d), kind),
-        gradient=jnp.zeros(d, kind),
-        own=jnp.zeros((windows, n, n), kind),
-        cross=jnp.zeros((windows, n, d), kind),
-        own_gradient=jnp.zeros((windows, n), kind),
-        pulls=jnp.zeros((windows, d), kind),
+    at, beside, noise = (jax.device_put(np.asarray(x, kind)) for x in (z, delta, sigma))
+    terms = _Terms(
+        jax.device_put(np.asarray(free)), shots.center, shots.shift, shots.spread, ROUGH if step else TOLERANCE
     )
-
-    rest = shots.y.shape[1] * shots.y.shape[2]
-    unseen = (jnp.zeros((windows, rest), kind), jnp.zeros((windows, d + n, rest), kind))
-
-    def propose(at: Any, here: Curvature, damping: Array) -> tuple[Any, Array]:
-        """Where a step leads, and by how much the cost should fall."""
-        precision, gradient, toward, shift = eliminate(here, damping)
-        precision = jnp.where(held, precision, jnp.eye(d)) + damping * jnp.diag(jnp.diagonal(here.hessian))
-        move = jnp.where(free, jnp.linalg.solve(precision, jnp.where(free, gradient, 0.0)), 0.0)
-        move = move * jnp.minimum(1.0, 2.0 / jnp.maximum(jnp.abs(move).max(initial=0.0), 1e-12))
-        moves = shift - toward @ move
-        stiff = move**2 @ jnp.diagonal(here.hessian) + (moves**2 * jnp.diagonal(here.own, axis1=-2, axis2=-1)).sum()
-        promised = 0.5 * (move @ here.gradient + (moves * here.own_gradient).sum() + damping * stiff)
-        return (at[0] + move, at[1] + moves * shots.spread), promised
-
-    def body(carry: Any) -> Any:
-        tried, kept, here, damping, promised, count, small = carry
-        seen = expand(predict, shots, tried[0], tried[1], sigma, step)
-        there = normal_equations(*seen, tried[0] - shots.center, (tried[1] - shots.shift) / shots.spread)
-        sound = jnp.isfinite(there.cost) & jnp.isfinite(there.gradient).all() & jnp.isfinite(there.hessian).all()
-        better = sound & (there.cost <= here.cost)
-        gain = jnp.where(better, (here.cost - there.cost) / jnp.maximum(jnp.abs(here.cost), 1e-12), 1.0)
-        gain, before = jnp.where(jnp.isfinite(gain), gain, 1.0), here.cost
-        kept, here = jax.tree.map(lambda x, y: jnp.where(better, x, y), ((*tried, *seen), there), (kept, here))
-        fulfilled = (before - there.cost) / jnp.maximum(promised, 1e-300)
-        eased = jnp.where(fulfilled > 0.75, damping / 5, jnp.where(fulfilled > 0.25, damping, damping * 2))
-        damping = jnp.where(better, jnp.maximum(eased, 1e-9), damping * 8)
-        tried, promised = propose(kept[:2], here, damping)
-        small = jnp.where(better & (gain < tolerance), small + 1, jnp.where(better, 0, small))
-        return tried, kept, here, damping.astype(kind), promised, count + 1, small
-
-    def more(carry: Any) -> Any:
-        _, _, here, damping, _, count, small = carry
-        return (count < steps) & (small < 2) & (damping < 1e9) & (jnp.isfinite(here.cost) | (count == 0))
-
-    start = ((z, delta), (z, delta, *unseen), nothing, jnp.asarray(damping, kind), zero, jnp.array(0), jnp.array(0))
-    _, (z, delta, r, slopes), here, last, _, count, small = jax.lax.while_loop(more, body, start)
-    precision, _, _, shift = eliminate(here)
-    return Fit(
-        z=z,
-        delta=delta,
-        sigma=sigma,
-        precision=jnp.where(held, precision, jnp.eye(d)),
-        pulls=jnp.where(free, here.pulls - jnp.einsum("wni,wn->wi", here.cross, shift), 0.0),
-        r=r.reshape(shots.y.shape),
-        slopes=slopes,
-        cost=here.cost,
-        steps=count,
-        converged=(small >= 2) | (last >= 1e9),
-        damping=last,
-    )
+    march = _set_out(at, beside, shots.y.shape[1] * shots.y.shape[2], damping)
+    for _ in range(int(steps)):
+        march = _go_on(march, _look(predict, shots, *march.tried, noise, step), terms)
+        small, last, cost = jax.device_get((march.small, march.damping, march.here.cost))
+        if small >= 2 or last >= 1e9 or not np.isfinite(cost):
+            break
+    return _end(march, noise, terms, shots.y.shape)
 
 
 def robust_covariance(fit: Fit) -> Float[Array, "d d"]:

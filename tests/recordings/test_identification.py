@@ -9,6 +9,7 @@ from bayessim_jax.recordings.identification import infer_case
 from bayessim_jax.recordings.loading import load_case
 from bayessim_jax.recordings.shots import case_model, split_windows
 from bayessim_jax.systems.skid_steer import SkidSteer
+from benchmarks.compilation import watch_compilation
 from benchmarks.worlds import make_case
 
 
@@ -142,3 +143,19 @@ def test_networks_name_what_the_recordings_do_not_inform(with_lift):
     found = inferred(with_lift, method="amortised")
     assert found.identifiability.not_informed == ["lift"]
     assert found.posterior.z[:, 1].std() == pytest.approx(1.0, abs=0.2)
+
+
+def test_a_machine_that_is_identified_again_is_not_compiled_again(tmp_path):
+    """Loaded anew, from other recordings: programs know the model by what it is made of."""
+    for seed in (3, 4):
+        make_case(tmp_path / str(seed), "slide", seed=seed, recordings=2, seconds=2.0)
+    inferred(tmp_path / "3")
+    with watch_compilation() as again:
+        inferred(tmp_path / "4")
+    assert again.spans == []
+    text = (tmp_path / "4" / "model.xml").read_text()
+    (tmp_path / "4" / "model.xml").write_text(text.replace('timestep="0.002"', 'timestep="0.001"'))
+    assert 'timestep="0.001"' in (tmp_path / "4" / "model.xml").read_text()
+    with watch_compilation() as other:
+        inferred(tmp_path / "4")
+    assert other.spans != []

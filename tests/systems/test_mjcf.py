@@ -9,7 +9,7 @@ from flax import struct
 
 from bayessim_jax.contracts import System
 from bayessim_jax.rollout import rollout
-from bayessim_jax.systems.mjcf import Unknown, mjcf_system
+from bayessim_jax.systems.mjcf import Unknown, mjcf_system, system_key
 from tests.engines.mechanisms import HOPPER, MODELS
 
 MASS = Unknown("pole_mass", ("body/pole/mass",), 0.2, 2.0, "kg")
@@ -131,3 +131,15 @@ def test_replay_is_a_scan_of_steps():
 def test_a_slip_is_named(arguments, message):
     with pytest.raises(ValueError, match=message):
         mjcf_system(MODELS["cart_pole"], [MASS], **arguments)
+
+
+def test_systems_are_the_same_that_are_made_of_the_same():
+    def made(**changes):
+        model = mujoco.MjSpec.from_string(MODELS["cart_pole"])
+        model.option.timestep = changes.pop("timestep", 0.002)
+        unknown = Unknown("mass", MASS.targets, *changes.pop("bounds", (0.5, 2.0)), "kg")
+        return system_key(mjcf_system(model, [unknown], engine="tree", **changes))
+
+    assert made() == made() and hash(made()) == hash(made())
+    others = [made(timestep=0.001), made(bounds=(0.5, 1.0)), made(substeps=2), made(scatter=0.1)]
+    assert len({made(), *others}) == 5
