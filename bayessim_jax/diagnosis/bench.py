@@ -236,8 +236,7 @@ class Bench:
     ) -> Fit:
         """Fit a candidate from a point."""
         used, shots = self.used(candidate), self.setup(candidate)
-        free = jax.device_put(np.ones(used, bool))
-        start = (_first(x, used), delta, sigma, free)
+        start = (np.asarray(x)[:used], delta, sigma, np.ones(used, bool))
         fit = solve(self.simulator(candidate), shots, *start, steps=steps, step=self.step, damping=damping)
         return fit.widen(self.size)
 
@@ -247,7 +246,7 @@ class Bench:
         """Predictions of windows from their recorded initial states, or from beside them."""
         still = jnp.broadcast_to(delta, (shots.y.shape[0], shots.spread.size))
         own = self.setup(candidate, shots)
-        return np.asarray(_replay(self.simulator(candidate), own, _first(x, self.used(candidate)), still))
+        return np.asarray(_replay(self.simulator(candidate), own, np.asarray(x)[: self.used(candidate)], still))
 
     def scatter(
         self,
@@ -260,11 +259,6 @@ class Bench:
         """Variance of predictions `here` where every part of the initial states is off by so much."""
         moved = (self.replay(candidate, x, shots, jnp.asarray(move)) for move in np.diag(start))
         return sum(((y - here) ** 2 for y in moved), np.zeros_like(here))
-
-
-def _first(x: Float[Array, " k"], used: int) -> Float[Array, " d"]:
-    """The numbers that are used, without a program of its own."""
-    return jax.device_put(np.asarray(x)[:used])
 
 
 def margin_of_effect(p: EffectParameter) -> Margin:
