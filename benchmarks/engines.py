@@ -186,7 +186,7 @@ def _compare_jacobian(name: str, problem: Problem, repeats: int) -> None:
     inputs = problem.thetas, problem.qpos, problem.ctrls
     forward, placed = compile_batched(last, *inputs)
     start = now()
-    derivative, _ = compile_spread(forward_jacobians(last, directions), *inputs)
+    derivative, _ = compile_spread(forward_jacobians(last, directions), *inputs, out_axes=(0, 1))
     seconds = now() - start
     _, _, ratio = _paired(
         lambda: jax.block_until_ready(forward(*placed)), lambda: jax.block_until_ready(derivative(*placed)), repeats

@@ -11,12 +11,15 @@ from bayessim_jax.engines.fields import find_writes, merge_writes
 from bayessim_jax.engines.tree import TreeEngine
 from tests.engines.mechanisms import MODELS
 
-THETAS = np.random.default_rng(0).uniform([0.5, -11.0], [1.5, -9.0], (8, 2)).astype(np.float32)
+THETAS = np.random.default_rng(0).uniform([0.5, -11.0], [1.5, -9.0], (384, 2)).astype(np.float32)
 
 
-@pytest.fixture(scope="module")
-def last():
+@pytest.fixture(scope="module", params=["spatial_arm", "dry_arm"])
+def last(request):
+    """The last of 20 steps of an arm without and with dry friction, whose solver is a loop within a step."""
     model = mujoco.MjModel.from_xml_string(MODELS["spatial_arm"])
+    if request.param == "dry_arm":
+        model.dof_frictionloss[:] = 0.05
     paths = ["body/l1/mass", "option/gravity/2"]
     engine = TreeEngine(model, merge_writes([find_writes(model, [p], k) for k, p in enumerate(paths)]))
 
@@ -27,13 +30,15 @@ def last():
     return run
 
 
-def test_a_spread_batch_is_the_batch(last):
-    compiled, placed = compile_batched(last, THETAS)
-    np.testing.assert_allclose(compiled(*placed), jax.jit(jax.vmap(last))(THETAS), rtol=1e-5, atol=1e-6)
+@pytest.mark.parametrize(("size", "out_axes"), [(131, 0), (384, -1)], ids=["whole", "in blocks"])
+def test_a_spread_batch_is_the_batch(last, size, out_axes):
+    compiled, placed = compile_batched(last, THETAS[:size], out_axes=out_axes)
+    expected = jax.jit(jax.vmap(last, out_axes=out_axes))(THETAS[:size])
+    np.testing.assert_allclose(compiled(*placed), expected, rtol=1e-5, atol=1e-6)
 
 
 def test_jacobians_of_a_batch_are_those_of_each(last):
-    compiled, placed = compile_spread(forward_jacobians(last, jnp.eye(2)), THETAS)
+    compiled, placed = compile_spread(forward_jacobians(last, jnp.eye(2)), THETAS, out_axes=(0, 1))
     values, tangents = compiled(*placed)
     np.testing.assert_allclose(values, jax.jit(jax.vmap(last))(THETAS), rtol=1e-5, atol=1e-6)
     each = jax.jit(jax.vmap(jax.jacfwd(last)))(THETAS)
