@@ -132,16 +132,21 @@ def score(
 
 
 def smallest_error(
-    ridge: Ridge, shots: Shots, start: Float[np.ndarray, " n"], scale: Float[np.ndarray, " obs"]
+    ridge: Ridge,
+    shots: Shots,
+    noise: Float[np.ndarray, " obs"],
+    start: Float[np.ndarray, " n"],
+    scale: Float[np.ndarray, " obs"],
 ) -> float:
     """The nrmse that noise alone leaves at a fit: of the sensors, and of the recorded initial states, propagated.
 
-    Var e = σ² + Σ_j (∂y/∂x_j)² s_j², with s the standard deviation of every coordinate of a recorded initial state.
+    Var e = σ² + Σ_j (∂y/∂x_j)² s_j², with σ the `noise` of the sensors and s (`start`) the standard deviation of every
+    coordinate of a recorded initial state.
     """
     sigma, spread = np.asarray(ridge.fit.sigma), np.asarray(shots.spread)
     shape = (ridge.slopes.shape[0], ridge.slopes.shape[1], *shots.y.shape[1:])
     grown = np.asarray(ridge.slopes).reshape(shape) * (start / spread)[:, None, None]
-    variance = (1 + (grown**2).sum(1)) * sigma**2
+    variance = noise**2 + (grown**2).sum(1) * sigma**2
     measured = np.asarray(shots.measured).copy()
     measured[:, 0] = False
     counts = measured.sum((0, 1))

@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from bayessim_jax.beliefs.margins import Margins
+from bayessim_jax.diagnosis.whiteness import difference_noise
 from bayessim_jax.inference.amortised import sample_amortised
-from bayessim_jax.inference.direct import sample_direct
+from bayessim_jax.inference.direct import noise_floor, sample_direct
 from bayessim_jax.inference.draws import PosteriorDraws
 from bayessim_jax.inference.identifiability import Identifiability, find_unidentified
 from bayessim_jax.inference.replay import Restarted
@@ -164,7 +165,7 @@ def infer_case(
     prior_mean = np.array([p.prior.mean for p in model.case.parameters])
     every = np.asarray(posterior.z)
     points = {"baseline": np.asarray(_standard(model.margins, prior_mean)), "posterior": every.mean(0)}
-    scale, fit = channel_scale(shots, left), posterior.fit
+    scale, fit, noise = channel_scale(shots, left), posterior.fit, _white_noise(posterior.fit, shots)
     scores, predictions = {}, {}
     for name, z in points.items():
         predictions[name] = predict_windows(predict, left, z)
@@ -181,9 +182,17 @@ def infer_case(
         predictions=predictions,
         band=band,
         scores=scores,
-        noise_floor=smallest_error(ridge(fit), shots, start_spread(model, fit), scale),
+        noise_floor=smallest_error(
+            ridge(fit), shots, noise, start_spread(model, dataclasses.replace(fit, sigma=jnp.asarray(noise))), scale
+        ),
         identifiability=find_unidentified(np.asarray(posterior.z), model.margins.names),
     )
+
+
+def _white_noise(fit: Fit, shots: Shots) -> Float[np.ndarray, " obs"]:
+    """The sensors' part of what a fit leaves: what differs from row to row, where the fit counts all of it as noise."""
+    rough = difference_noise(np.nan_to_num(fit.misses), np.asarray(shots.measured))
+    return np.minimum(np.maximum(rough, np.asarray(noise_floor(shots))), np.asarray(fit.sigma))
 
 
 _standard = jax.jit(Margins.standard)

@@ -8,6 +8,7 @@ import pytest
 from bayessim_jax.recordings.identification import infer_case
 from bayessim_jax.recordings.loading import load_case
 from bayessim_jax.recordings.shots import case_model, split_windows
+from bayessim_jax.report.infer import worries
 from bayessim_jax.systems.skid_steer import SkidSteer
 from benchmarks.compilation import watch_compilation
 from benchmarks.worlds import make_case
@@ -42,7 +43,17 @@ def test_parameters_noise_and_predictions_of_a_pendulum(tmp_path):
     assert result.scores["posterior"].nrmse < 1.3 * result.noise_floor
     assert result.scores["posterior"].nrmse < result.scores["baseline"].nrmse
     assert set(result.fitted.recording) & set(result.held_out.recording) == set()
+    assert worries(result) == []
     assert result.identifiability.not_informed == []
+
+
+def test_predictions_that_miss_by_more_than_noise_are_a_worry(tmp_path):
+    """The fit counts all that friction does as noise; the sensors' own is what differs from row to row."""
+    make_case(tmp_path / "rig", "pendulum", ["coulomb_friction"], strength=0.3, seed=3)
+    result = inferred(tmp_path / "rig")
+    assert np.asarray(result.posterior.fit.sigma)[0] > 3e-3
+    assert result.scores["posterior"].nrmse > 2 * result.noise_floor
+    assert any("something is missing in the simulator" in worry for worry in worries(result))
 
 
 def test_without_measured_velocities(tmp_path):
