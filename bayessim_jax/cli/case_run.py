@@ -61,7 +61,6 @@ class CaseRun:
         except ValueError as error:
             raise UsageError(str(error)) from error
         facts = {
-            "status": "running",
             "command": shlex.join(["bayessim", name, *words]),
             "folder": str(folder.path),
             "started": _now(),
@@ -88,7 +87,7 @@ class CaseRun:
         use_compilation_cache()
         device = jax.devices()[0]
         self.facts["device"] = {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count()}
-        self.folder.write_run(self.facts)
+        self.folder.write_run(self.facts | {"status": "running"})
         self.double = bool(jax.config.read("jax_enable_x64"))
         jax.config.update("jax_enable_x64", True)  # for the whole process: engines are called on threads of their own
         return self
