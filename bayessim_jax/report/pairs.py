@@ -76,11 +76,13 @@ def pair_plot(
                 diagonal(ax, i) if i == j else below(ax, i, j)
                 ax.set_xlim(*limits[j])
                 ax.locator_params(axis="x", nbins=4)
-                ax.tick_params(axis="x", labelbottom=i == d - 1)
+                ax.ticklabel_format(axis="x", useOffset=False)
+                ax.tick_params(axis="x", labelbottom=i == d - 1, labelrotation=30 if magnify else 0)
                 if i == d - 1:
                     ax.set_xlabel(quantity(names[j], units[j]))
                 if i != j:
                     ax.locator_params(axis="y", nbins=4)
+                    ax.ticklabel_format(axis="y", useOffset=False)
                     ax.tick_params(axis="y", labelleft=j == 0)
                     if j == 0:
                         ax.set_ylabel(quantity(names[i], units[i]))
