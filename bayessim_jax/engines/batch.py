@@ -13,6 +13,8 @@ from jax.extend.core import jaxprs_in_params
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
+from bayessim_jax.engines.tree.constraints import SOLVER
+
 __all__ = ["TASKS", "WIDE", "compile_batched", "compile_spread", "forward_jacobians"]
 
 TASKS = "cpu-parallel-task-assigner"
@@ -22,9 +24,9 @@ WIDE = {"xla_cpu_prefer_vector_width": "512"}
 LOOPS: Any = {"xla_disable_hlo_passes": TASKS, **WIDE}
 """No splitting of each small loop over threads, and wide vectors: a loop over time steps is one piece of code."""
 SOLVERS: Any = {"xla_disable_hlo_passes": f"{TASKS},cse_barrier_expander,small-while-loop-hoisting", **WIDE}
-"""For steps with a loop of their own, such as the solver of dry friction and joint limits: barriers that hold until
-code is made keep the compiler from repeating the step's equations in that loop for every joint, which is twice as quick
-from two joints on. Loops that hold barriers cannot be made one piece of code (`docs/architecture.md`)."""
+"""For steps with the solver of dry friction and joint limits, a loop of its own: barriers that hold until code is made
+keep the compiler from repeating the step's equations in that loop for every joint, which is twice as quick from two
+joints on. Loops that hold barriers cannot be made one piece of code (`docs/architecture.md`)."""
 BLOCK = 128
 """Simulations that go through all their time steps together: what one step of so many needs stays in a core's cache."""
 
@@ -82,9 +84,9 @@ def _joined(x: Array, axis: int) -> Array:
 
 
 def _solves(jaxpr: Any) -> bool:
-    """Whether a program has loops of a length that is not known beforehand."""
+    """Whether a program holds the solver of dry friction and joint limits."""
     return any(
-        equation.primitive.name == "while" or any(map(_solves, jaxprs_in_params(equation.params)))
+        SOLVER in str(equation.source_info.name_stack) or any(map(_solves, jaxprs_in_params(equation.params)))
         for equation in jaxpr.eqns
     )
 

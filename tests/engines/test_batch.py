@@ -37,6 +37,11 @@ def test_a_spread_batch_is_the_batch(last, size, out_axes):
     np.testing.assert_allclose(compiled(*placed), expected, rtol=1e-5, atol=1e-6)
 
 
+def test_barriers_hold_where_a_step_solves_for_friction(last, request):
+    compiled, _ = compile_batched(last, THETAS[:8])
+    assert ("opt-barrier" in compiled.as_text()) == ("dry_arm" in request.node.name)
+
+
 def test_jacobians_of_a_batch_are_those_of_each(last):
     compiled, placed = compile_spread(forward_jacobians(last, jnp.eye(2)), THETAS, out_axes=(0, 1))
     values, tangents = compiled(*placed)

@@ -22,7 +22,10 @@ from bayessim_jax.engines.tree.folding import Folded, fold, settle
 from bayessim_jax.engines.tree.links import Numbers
 from bayessim_jax.engines.tree.solve import add_to_diagonal, solve
 
-__all__ = ["Constraint", "constraint_forces", "find_constraints", "inverse_weights"]
+__all__ = ["SOLVER", "Constraint", "constraint_forces", "find_constraints", "inverse_weights"]
+
+SOLVER = "constraint_solver"
+"""Name of the solver's loop among a program's operations (`jax.named_scope`)."""
 
 SEARCHES = 3
 """Points that are tried on the way of a Newton step."""
@@ -177,7 +180,8 @@ class _Problem(NamedTuple):
 
         start = self.solve_pieces([_sticking(c, row) for c, row in zip(self.constraints, self.rows, strict=True)])
         rounds = 2 + 2 * len({c.joint for c in self.constraints})
-        found, _ = jax.lax.scan(improve, tuple(x.value for x in start), length=rounds)
+        with jax.named_scope(SOLVER):
+            found, _ = jax.lax.scan(improve, tuple(x.value for x in start), length=rounds)
         return [fold(x) for x in found]
 
     def pieces(self, accelerations: Sequence[Folded]) -> list[tuple[Folded, Folded]]:
