@@ -58,6 +58,8 @@ WIDEST = 4
 """Effects of a set."""
 SIMPLE, AGAIN = 2, 4
 """Parameters of a candidate that is simulated from one point only, and how many others, and rivals, are from more."""
+ROUNDS = 3
+"""How often rivals are fitted from the best one's numbers, where one of them then is the best."""
 KIN = 2
 """Relatives of the best pair's members, of which partners are looked for as well."""
 WORTH = 0.5
@@ -436,7 +438,8 @@ def _finish(
 
     The best of those with many parameters that leave something are fitted from their usual values, too: where joints
     stick and slip, what fits along the smoothed motion may be far from what fits in simulation. Rivals of the best are
-    fitted from its numbers: it must not win by a better start. What was fitted before is taken as it was.
+    fitted from its numbers, and where one of them is then the best, rivals from its own: none must win by a better
+    start. What was fitted before is taken as it was.
     """
     bench, before = work.bench, dict(work.done)
     work.say(f"simulating {sum(c.candidate not in before for c in candidates)} candidates; compiling takes a while")
@@ -473,9 +476,12 @@ def _finish(
         fresh = [e for e in entries if e.candidate not in before]
         left = [e for e in fresh if e.misfit.p_value < FALSE_ALARMS and len(bench.columns(e.candidate)) > SIMPLE]
         _replace(work, entries, zip(left, pool.map(from_usual, left[:AGAIN]), strict=False))
-        best = entries[0] if entries else none
-        rivals = [entry for entry in entries if _are_rivals(entry, best, none, thresholds)][:AGAIN]
-        _replace(work, entries, zip(rivals, pool.map(partial(from_numbers_of, best), rivals), strict=True))
+        for _ in range(ROUNDS if entries else 0):
+            best = entries[0]
+            rivals = [entry for entry in entries if _are_rivals(entry, best, none, thresholds)][:AGAIN]
+            _replace(work, entries, zip(rivals, pool.map(partial(from_numbers_of, best), rivals), strict=True))
+            if entries[0] is best:
+                break
     work.done |= {entry.candidate: entry for entry in entries}
     if ahead is not None and entries:
         _look_ahead(bench, none, entries, ahead)
