@@ -46,10 +46,14 @@ __all__ = ["Problem", "detect", "is_mismatch", "name_effects"]
 
 T, R = TypeVar("T"), TypeVar("R")
 
-SCREENED = 60
-"""Windows with which every candidate is tried at first."""
+SCREENED, FEWEST = 60, 30
+"""Windows with which every candidate is tried at first, and how few will do where many things are measured."""
+NUMBERS = 15_000
+"""What was measured in these windows, from where on fewer will do."""
 FINALISTS, LEADERS, PAIRS = 7, 2, 4
 """Single effects that are simulated at most, at least, and pairs."""
+RACED, PLACES = 40, 2
+"""Single effects, and places of each effect, that go on after their first steps along the motion."""
 FINISHED = 14
 """Single effects that are fitted to the end along the motion."""
 GLANCED = 4
@@ -58,7 +62,12 @@ WIDEST = 4
 """Effects of a set."""
 SIMPLE, AGAIN = 2, 4
 """Parameters of a candidate that is simulated from one point only, and how many others, and rivals, are from more."""
-ROUNDS = 3
+SHORT = 0.01
+"""Share of the misfit that a candidate leaves in simulation beyond what it does along the motion, from where on it is
+simulated from more points."""
+HOPELESS = 0.25
+"""Share that it leaves along the motion, from where on it is not, if another one explains the misfit."""
+TURNS = 3
 """How often rivals are fitted from the best one's numbers, where one of them then is the best."""
 KIN = 2
 """Relatives of the best pair's members, of which partners are looked for as well."""
@@ -68,8 +77,8 @@ DOUBT = 0.05
 """Probability that a model fails in a window, where the simulator without effects then predicts."""
 WORKERS = 2
 """Candidates that are tried at the same time."""
-ROUNDS = 4
-"""Of a fit and its noise, at most."""
+ROUNDS, STEPS = 4, 8
+"""Of a fit and its noise after the first fit, at most, and of the solver in each."""
 ENOUGH = 0.5
 """Share of the windows that have to be known to have a full past, for the others not to count against a memory."""
 FOLDS = 4
@@ -101,7 +110,7 @@ class _Work:
         for _ in range(ROUNDS):
             sigma = estimate_noise(self.bench.shots, fit, self.floor, free, LEAST_SHARE)
             change = np.abs(np.log(np.asarray(sigma) / np.asarray(fit.sigma))).max()
-            fit = self.bench.fit(candidate, fit.z, fit.delta, sigma, damping=fit.damping)
+            fit = self.bench.fit(candidate, fit.z, fit.delta, sigma, steps=STEPS, damping=fit.damping)
             if change < 0.03:
                 break
         return fit
@@ -133,7 +142,8 @@ class Problem:
     def screen(self, pairs: Sequence[tuple[Any, str]], slots: int = SLOTS) -> Screen:
         """Pairs to be held against some of the windows."""
         count = len(self.group)
-        rows = np.unique(np.linspace(0, count - 1, min(SCREENED, count)).astype(int))
+        enough = int(NUMBERS * count / max(np.asarray(self.shots.measured).sum(), 1))
+        rows = np.unique(np.linspace(0, count - 1, min(max(FEWEST, enough), SCREENED, count)).astype(int))
         every = (self.motion, self.shots.inputs, self.shots.y, self.shots.measured)
         motion, inputs, y, measured = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[rows]), every)
         shots = dataclasses.replace(self.shots, inputs=inputs, y=y, measured=measured)
@@ -194,15 +204,16 @@ def name_effects(
     singles = _finalists(screen, nothing, ranked)
     work = _begin_work(key, problem, say)
     none = _without(work, problem, detected)
-    entries = _finish(work, none, singles, problem.ahead, thresholds)
+    before = screen.misfit(key, nothing)
+    remain = lambda found: share_left(screen.misfit(key, found), before)  # noqa: E731
+    finish = partial(_finish, work, none, remain, ahead=problem.ahead, thresholds=thresholds)
+    entries = finish(singles)
     left = share_left(entries[0].misfit, none.misfit) if entries else 1.0
     explained = bool(entries) and explains(entries[0], none, thresholds)
     # where nothing is predicted ahead, what shows in the windows themselves is all that tells of another effect
     shows = explained and problem.ahead is None and entries[0].misfit.p_value < FALSE_ALARMS
     if left > thresholds.enough or not explained or shows or entries[0].ahead > thresholds.doubtful:
         say("one effect is not enough: trying pairs")
-        before = screen.misfit(key, nothing)
-        remain = lambda found: share_left(screen.misfit(key, found), before)  # noqa: E731
         worth = thresholds.worth * remain(ranked[0]) if explained else np.inf
         growth = _Growth(screens, begun)
         pairs = [pair for pair in _pair(key, growth, nothing, ranked)[:PAIRS] if remain(pair) < worth]
@@ -210,7 +221,7 @@ def name_effects(
             alone = {k for pair in pairs for k in pair.candidate.effects}
             best = {k for entry in entries[:2] for k in entry.candidate.effects}
             kept = [*pairs, *(found for found in ranked if found.candidate.effects[0] in alone | best)]
-            entries = _finish(work, none, kept, problem.ahead, thresholds)
+            entries = finish(kept)
             while entries and _is_too_narrow(entries, none, thresholds):
                 leads = [_settled(screen, entry, kept) for entry in _widest(work.bench, none, entries)]
                 grown = [(found, known) for known in leads for found in growth.extend(known)]
@@ -220,7 +231,7 @@ def name_effects(
                 say(f"{len(leads[0].candidate.effects)} effects are not enough: trying another one")
                 wider = sorted(wider, key=lambda found: -found.score)[:PAIRS]
                 kept = [*wider, *kept]
-                entries = _finish(work, none, kept, problem.ahead, thresholds)
+                entries = finish(kept)
     return decide(work.bench, none, entries, work.group, thresholds, listed)
 
 
@@ -277,7 +288,8 @@ class _Growth:
         def finish(screen: Screen, item: tuple[Candidate, Screened]) -> Screened | None:
             candidate, beside = item
             started = screen.begin_candidate(candidate, beside)
-            return screen.finish_candidate(started, beside) if started is not None else None
+            raced = screen.resume_candidate(started, beside) if started is not None else None
+            return screen.finish_candidate(raced, beside) if raced is not None else None
 
         return [each for each in _each(self.screens, [*grown, *split], finish) if each is not None]
 
@@ -326,10 +338,29 @@ def _rank(
             say(f"{k} of {len(singles)}")
         return begun
 
-    every = [begun for begun in _each(screens, singles, begin) if begun and np.isfinite(begun.likelihood)]
-    every.sort(key=lambda begun: -begun.likelihood)
+    def ranked(found: Iterable[Begun | None]) -> list[Begun]:
+        finite = [begun for begun in found if begun and np.isfinite(begun.likelihood)]
+        return sorted(finite, key=lambda begun: -begun.likelihood)
+
+    begun = ranked(_each(screens, singles, begin))
+    ahead = _promising(screens[0], begun)
+    raced = _each(screens, ahead, lambda screen, begun: screen.resume_candidate(begun, nothing))
+    going = {each.candidate for each in ahead}
+    every = ranked([*raced, *(each for each in begun if each.candidate not in going)])
     ended = _each(screens, every[:FINISHED], lambda screen, begun: screen.finish_candidate(begun, nothing))
     return sorted((e for e in ended if e is not None), key=lambda e: -e.score), every
+
+
+def _promising(screen: Screen, begun: Sequence[Begun]) -> list[Begun]:
+    """The best ones, and the best places of every effect: some explain little before their last steps."""
+    places: dict[str, int] = {}
+    found = []
+    for rank, each in enumerate(begun):
+        name = screen.pairs[each.candidate.effects[0]][0].name
+        places[name] = places.get(name, 0) + 1
+        if rank < RACED or places[name] <= PLACES:
+            found.append(each)
+    return found
 
 
 def _finalists(screen: Screen, nothing: Screened, ranked: Sequence[Screened]) -> list[Screened]:
@@ -432,14 +463,20 @@ def _with_numbers_of(bench: Bench, best: Entry, other: Entry) -> Float[Array, " 
 
 
 def _finish(
-    work: _Work, none: Entry, candidates: Sequence[Screened], ahead: Shots | None, thresholds: Thresholds
+    work: _Work,
+    none: Entry,
+    remain: Callable[[Screened], float],
+    candidates: Sequence[Screened],
+    *,
+    ahead: Shots | None,
+    thresholds: Thresholds,
 ) -> list[Entry]:
     """Candidates simulated and fitted from where the screen found them, and scored across recordings, best first.
 
-    The best of those with many parameters that leave something are fitted from their usual values, too: where joints
-    stick and slip, what fits along the smoothed motion may be far from what fits in simulation. Rivals of the best are
-    fitted from its numbers, and where one of them is then the best, rivals from its own: none must win by a better
-    start. What was fitted before is taken as it was.
+    The best of those with many parameters that leave more than `remain` says of the motion are fitted from their usual
+    values, too: where joints stick and slip, what fits there may be far from what fits in simulation. Rivals of the
+    best are fitted from its numbers, and where one of them is then the best, rivals from its own: none must win by a
+    better start. What was fitted before is taken as it was.
     """
     bench, before = work.bench, dict(work.done)
     work.say(f"simulating {sum(c.candidate not in before for c in candidates)} candidates; compiling takes a while")
@@ -473,10 +510,19 @@ def _finish(
                 if entry.candidate not in before:
                     work.say(f"{' + '.join(entry.names)}: score {entry.score:.1f}")
         entries.sort(key=lambda entry: -entry.score)
+        screened = {found.candidate: found for found in candidates}
+        explained = bool(entries) and share_left(entries[0].misfit, none.misfit) <= thresholds.left
+
+        def falls_short(entry: Entry) -> bool:
+            promised = remain(screened[entry.candidate])
+            hopeless = explained and promised > HOPELESS
+            return not hopeless and share_left(entry.misfit, none.misfit) > promised + SHORT
+
         fresh = [e for e in entries if e.candidate not in before]
         left = [e for e in fresh if e.misfit.p_value < FALSE_ALARMS and len(bench.columns(e.candidate)) > SIMPLE]
+        left = [e for e in left if falls_short(e)]
         _replace(work, entries, zip(left, pool.map(from_usual, left[:AGAIN]), strict=False))
-        for _ in range(ROUNDS if entries else 0):
+        for _ in range(TURNS if entries else 0):
             best = entries[0]
             rivals = [entry for entry in entries if _are_rivals(entry, best, none, thresholds)][:AGAIN]
             _replace(work, entries, zip(rivals, pool.map(partial(from_numbers_of, best), rivals), strict=True))
@@ -493,8 +539,9 @@ def _look_ahead(bench: Bench, none: Entry, entries: Sequence[Entry], ahead: Shot
 
     Initial states are off by what the best candidate's fit moved them.
     """
-    base, best = bench.replay(Candidate(), none.fit.z, ahead), entries[0]
-    predicted = [bench.replay(entry.candidate, entry.fit.z, ahead) for entry in entries]
+    best = entries[0]
+    with ThreadPoolExecutor(WORKERS) as pool:
+        base, *predicted = pool.map(lambda e: bench.replay(e.candidate, e.fit.z, ahead), [none, *entries])
     spread = np.nan_to_num(bench.scatter(best.candidate, best.fit.z, ahead, best.fit.usual_move, predicted[0]))
     for entry, here in zip(entries, predicted, strict=True):
         entry.ahead = error_left(ahead, here, base, entry.misfit.noise, spread)

@@ -12,7 +12,6 @@ that candidates are compared without simulating any of them, and without compili
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -20,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from bayessim_jax.contracts import Scalar
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Curvature, eliminate, normal_equations
@@ -33,8 +32,10 @@ __all__ = [
     "Windowed",
     "assess",
     "cross_validate",
+    "find_gap",
     "linearize_steps",
     "propose",
+    "respond",
 ]
 
 
@@ -80,15 +81,15 @@ class Windowed:
 
 @struct.dataclass
 class Forcing:
-    """What a candidate adds to every row's step, and to readings, at one point of its parameters."""
+    """What a candidate adds to every row's step, and to readings, at one point of its e parameters."""
 
     force: Float[Array, "windows steps nv"]
-    force_along: Float[Array, "windows steps nv k"]
+    force_along: Float[Array, "windows steps nv e"]
     scale: Float[Array, "windows rows obs"]
     """Readings are `scale · reading + shift`: 1 where no sensor is concerned."""
     shift: Float[Array, "windows rows obs"]
-    reading_along: Float[Array, "windows rows obs k"]
-    first_along: Float[Array, "windows n k"]
+    reading_along: Float[Array, "windows rows obs e"]
+    first_along: Float[Array, "windows n e"]
     """How the motion's first state moves with what readings are restored by."""
 
 
@@ -113,6 +114,50 @@ def _rotation(origin: Float[Array, "4"], to: Float[Array, "4"]) -> Float[Array, 
     return 2.0 * jnp.sign(ow * w + ov @ v) * turn
 
 
+def _rows(motion: Motion) -> tuple[Array, ...]:
+    """Positions and velocities of every row and of the next one, and the command between them."""
+    return motion.qpos[:, :-1], motion.qvel[:, :-1], motion.qpos[:, 1:], motion.qvel[:, 1:], motion.ctrl
+
+
+def _miss(engine: Any, substeps: int, row: tuple[Array, ...], move: Array, force: Array, inner: Array) -> Array:
+    """How far one row's step from beside the motion, under a force, leads from the next row."""
+    q, v, q_next, v_next, u = row
+    nv = engine.model.nv
+    state = engine.init(inner, displace(engine.model, q, move[:nv]), v + move[nv:])
+    after = engine.step(inner, state, u, force, substeps)
+    return jnp.concatenate([separate(engine.model, q_next, engine.qpos(after)), engine.qvel(after) - v_next])
+
+
+@partial(jax.jit, static_argnames=("engine", "numbers", "substeps"), compiler_options=COMPILER_OPTIONS)
+def find_gap(
+    engine: Any,
+    numbers: Any,
+    motion: Motion,
+    points: Float[Array, "k+1 m"],
+    count: int | Int[Array, ""],
+    length: float,
+    substeps: int,
+) -> tuple[Float[Array, "windows steps n"], Float[Array, "windows steps n k"]]:
+    """Every row's step from the motion at a point, the first, and its derivatives towards others, `length` away.
+
+    Of the points only the first `count` are looked at; derivatives towards the rest are 0.
+    """
+    nv = engine.model.nv
+
+    def gap(x: Float[Array, " m"]) -> Float[Array, "windows steps n"]:
+        inner, still = numbers(x), (jnp.zeros(2 * nv), jnp.zeros(nv))
+        return jax.vmap(jax.vmap(lambda *row: _miss(engine, substeps, row, *still, inner)))(*_rows(motion))
+
+    def put(k: Array, every: Array) -> Array:
+        return every.at[k].set(gap(points[k]))
+
+    empty = jnp.zeros((len(points), *motion.ctrl.shape[:2], 2 * nv))
+    every = jax.lax.fori_loop(0, count, put, empty)
+    slopes = (every[1:] - every[0]) / length
+    looked = (jnp.arange(1, len(points)) < count)[:, None, None, None]
+    return every[0], jnp.moveaxis(jnp.where(looked, slopes, 0.0), 0, -1)
+
+
 @partial(jax.jit, static_argnames=("engine", "numbers", "substeps", "step"), compiler_options=COMPILER_OPTIONS)
 def linearize_steps(
     engine: Any,
@@ -127,17 +172,12 @@ def linearize_steps(
 
     `numbers(x)` is the engine's θ. Forward-mode derivatives, or central differences of length `step`.
     """
-    model = engine.model
-    nv = model.nv
+    nv = engine.model.nv
     inner, inner_along = numbers(x), jax.vmap(lambda v: jax.jvp(numbers, (x,), (v,))[1])(along)
 
-    def one(q: Array, v: Array, q_next: Array, v_next: Array, u: Array) -> tuple[Array, ...]:
-        def advance(move: Array, force: Array, inner: Array) -> Array:
-            state = engine.init(inner, displace(model, q, move[:nv]), v + move[nv:])
-            after = engine.step(inner, state, u, force, substeps)
-            return jnp.concatenate([separate(model, q_next, engine.qpos(after)), engine.qvel(after) - v_next])
-
-        point = (jnp.zeros(2 * nv, v.dtype), jnp.zeros(nv, v.dtype), inner)
+    def one(*row: Array) -> tuple[Array, ...]:
+        advance = partial(_miss, engine, substeps, row)
+        point = (jnp.zeros(2 * nv), jnp.zeros(nv), inner)
         size = 3 * nv + len(along)
         directions = (
             jnp.zeros((size, 2 * nv)).at[: 2 * nv].set(jnp.eye(2 * nv)),
@@ -153,8 +193,7 @@ def linearize_steps(
         slopes = slopes.T
         return slopes[:, : 2 * nv], slopes[:, 2 * nv : 3 * nv], slopes[:, 3 * nv :], gap
 
-    rows = (motion.qpos[:, :-1], motion.qvel[:, :-1], motion.qpos[:, 1:], motion.qvel[:, 1:], motion.ctrl)
-    return Linearized(*jax.vmap(jax.vmap(one))(*rows))
+    return Linearized(*jax.vmap(jax.vmap(one))(*_rows(motion)))
 
 
 def _propagate(a: Array, first: Float[Array, "n k"], added: Float[Array, "steps n k"]) -> Float[Array, "rows n k"]:
@@ -167,9 +206,27 @@ def _propagate(a: Array, first: Float[Array, "n k"], added: Float[Array, "steps 
     return jnp.concatenate([first[None], jax.lax.scan(once, first, (a, added))[1]])
 
 
+def _see(
+    lin: Linearized, windowed: Windowed, first: Float[Array, "windows n k"], added: Float[Array, "windows steps n k"]
+) -> Float[Array, "windows rows obs k"]:
+    """What the sensors show of several deviations."""
+    return jnp.einsum("wton,wtnk->wtok", windowed.c, jax.vmap(_propagate)(lin.a, first, added))
+
+
+@partial(jax.jit, static_argnames="d", compiler_options=COMPILER_OPTIONS)
+def respond(lin: Linearized, windowed: Windowed, d: int) -> Float[Array, "windows dn rowsobs"]:
+    """How readings move with θ's z and with the initial state: what no candidate changes to first order."""
+    count, steps, n = lin.gap.shape
+    first = jnp.broadcast_to(jnp.eye(n, d + n, d), (count, n, d + n))
+    added = jnp.concatenate([lin.along[..., :d], jnp.zeros((count, steps, n, n))], -1)
+    slopes = jnp.moveaxis(_see(lin, windowed, first, added).reshape(count, -1, d + n), 1, 2)
+    return slopes.at[:, d:].multiply(windowed.spread[:, None])
+
+
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)
 def assess(
     lin: Linearized,
+    shared: Float[Array, "windows dn rowsobs"],
     windowed: Windowed,
     forcing: Forcing,
     moved: Float[Array, " k"],
@@ -180,30 +237,21 @@ def assess(
     """Normal equations, residuals over σ and derivatives of what is predicted over σ.
 
     p is [θ's z, the candidate's x], each with a standard normal prior, and `moved` how far it is from where the steps
-    were linearized.
+    were found; `shared` is what `respond` says of steps linearized there or nearby.
     """
-    n, k = delta.shape[-1], p.size
-    # steps are linearized along the first of p only, where the rest does not change them
-    lin = replace(lin, along=jnp.pad(lin.along, [(0, 0)] * 3 + [(0, k - lin.along.shape[-1])]))
-
-    def one(a: Array, b: Array, along: Array, gap: Array, w: Windowed, f: Forcing, d: Array) -> tuple[Array, Array]:
-        forced = gap + jnp.einsum("tnv,tv->tn", b, f.force) + along @ moved
-        columns = along + jnp.einsum("tnv,tvk->tnk", b, f.force_along)
-        first = jnp.concatenate([d[:, None], f.first_along, jnp.eye(n)], 1)
-        added = jnp.concatenate([forced[..., None], columns, jnp.zeros((len(gap), n, n))], -1)
-        seen = jnp.einsum("ton,tnk->tok", w.c, _propagate(a, first, added))
-        value = f.scale * (w.seen + seen[..., 0]) + f.shift
-        slopes = f.scale[..., None] * seen[..., 1:]
-        slopes = slopes.at[..., :k].add(f.reading_along)
-        r = jnp.where(w.measured, (w.y - value) / sigma, 0.0)
-        slopes = jnp.where(w.measured[..., None], slopes / sigma[:, None], 0.0)
-        return r, slopes.reshape(-1, k + n).T
-
-    spread = jnp.broadcast_to(windowed.spread, (len(delta), n))
-    each = replace(windowed, spread=spread)
-    r, slopes = jax.vmap(one)(lin.a, lin.b, lin.along, lin.gap, each, forcing, delta)
-    slopes = slopes.at[:, k:].multiply(windowed.spread[:, None])
-    return normal_equations(r.reshape(len(delta), -1), slopes, p, delta / windowed.spread), r, slopes
+    count, d = len(delta), p.size - forcing.force_along.shape[-1]
+    forced = lin.gap + jnp.einsum("wtnv,wtv->wtn", lin.b, forcing.force) + lin.along @ moved
+    columns = lin.along[..., d:] + jnp.einsum("wtnv,wtvk->wtnk", lin.b, forcing.force_along)
+    first = jnp.concatenate([delta[..., None], forcing.first_along], -1)
+    seen = _see(lin, windowed, first, jnp.concatenate([forced[..., None], columns], -1))
+    value = forcing.scale * (windowed.seen + seen[..., 0]) + forcing.shift
+    own = forcing.scale[..., None] * seen[..., 1:] + forcing.reading_along
+    weight = jnp.where(windowed.measured, 1.0 / sigma, 0.0)
+    r = jnp.where(windowed.measured, (windowed.y - value) / sigma, 0.0)
+    own = jnp.moveaxis((own * weight[..., None]).reshape(count, -1, own.shape[-1]), 1, 2)
+    rest = shared * (forcing.scale * weight).reshape(count, 1, -1)
+    slopes = jnp.concatenate([rest[:, :d], own, rest[:, d:]], 1)
+    return normal_equations(r.reshape(count, -1), slopes, p, delta / windowed.spread), r, slopes
 
 
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)

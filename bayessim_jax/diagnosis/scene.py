@@ -16,12 +16,21 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from bayessim_jax.beliefs.margins import Margin, Margins
 from bayessim_jax.diagnosis.bench import SLOTS, Candidate, CandidatesOf, margin_of_effect
 from bayessim_jax.diagnosis.forcing import Joint, commands_of, force_of, restore_readings
-from bayessim_jax.diagnosis.response import Forcing, Linearized, Motion, Windowed, assess, linearize_steps
+from bayessim_jax.diagnosis.response import (
+    Forcing,
+    Linearized,
+    Motion,
+    Windowed,
+    assess,
+    find_gap,
+    linearize_steps,
+    respond,
+)
 from bayessim_jax.effects import Scales, at, with_effects
 from bayessim_jax.effects.contract import Numbers
 from bayessim_jax.effects.drive import CAUTION, actuators_of, drive_of, read_numbers
@@ -38,20 +47,24 @@ __all__ = ["Scene"]
 FINE = 4
 """Most time steps in a row at which effects are evaluated."""
 MOVED = 0.15
-"""How far θ's z and parameters of effects on the model may move before the steps are linearized anew."""
+"""How far θ's z and parameters of effects on the model may move before it is found anew where the steps lead."""
+HOMES = 8
+"""Points around which the steps were linearized that are kept."""
 
 
 @dataclass
 class _Around:
-    """Steps linearized around a motion, and what effects see of its joints."""
+    """Steps around a motion, and what effects see of its joints."""
 
     edits: tuple[tuple[int, int], ...]
     """Effects on the model, and where the parameters of each begin in p."""
     p: Float[np.ndarray, " k"]
-    """Where θ and the parameters of effects on the model were."""
+    """θ and the parameters of effects on the model, where it was found what the steps lead to."""
     motion: Motion
     lin: Linearized
     windowed: Windowed
+    shared: Float[Array, "windows dn rowsobs"]
+    """How readings move with θ's z and initial states."""
     kept: dict[Any, Any] = field(default_factory=dict)
 
 
@@ -94,14 +107,16 @@ class Scene(CandidatesOf):
         self.fine = next(s for s in range(min(FINE, rows), 0, -1) if rows % s == 0)
         self.h = system.dt / self.fine
         self.times = _device(np.asarray(motion.start)[:, None] + self.h * np.arange(motion.ctrl.shape[1] * self.fine))
-        self._around: dict[bool, _Around] = {}
-        self._home: tuple[bytes, _Around] | None = None
+        self.length = step or float(jnp.finfo(float).eps) ** (1 / 3)
+        self._homes: dict[Any, _Around] = {}
+        self._base: _Around | None = None
+        self._recent: _Around | None = None
         self._kept: dict[Any, Any] = {}
 
     def twin(self) -> Scene:
         """The same scene for another thread: what is kept from fit to fit is its own, compiled programs are shared."""
         twin = copy.copy(self)
-        twin._around, twin._home, twin._kept = {}, None, {}
+        twin._homes, twin._base, twin._recent, twin._kept = {}, None, None, {}
         return twin
 
     def takes(self, candidate: Candidate) -> bool:
@@ -118,27 +133,50 @@ class Scene(CandidatesOf):
     ) -> tuple[Curvature, Float[Array, "windows rows obs"], Float[Array, "windows kn rowsobs"]]:
         """Normal equations at a point, residuals over σ, and derivatives of what is predicted over σ."""
         motion, readings = self._restored(candidate, p)
-        around = self._linearized(candidate, p, motion)
+        around = self._find_around(candidate, p, motion)
         pushes = [push for k, place in self.offsets(candidate) for push in self._pushes(k, p, place, around)]
         sensed = []
         if readings:
             raw = self._windowed(p, self.motion).seen
             sensed = [(channel, raw[..., channel], *rest) for channel, *rest in readings]
-        forcing = _assemble(around.windowed.seen, pushes, sensed, self.model.nv, p.size)
+        forcing = _assemble(around.windowed.seen, pushes, sensed, self.model.nv, self.slots)
         moved = np.where(self._steps(candidate), p - around.p, 0.0)
-        return assess(around.lin, around.windowed, forcing, moved, p, delta, sigma)
+        return assess(around.lin, around.shared, around.windowed, forcing, moved, p, delta, sigma)
 
     def states(self, delta: Float[Array, "windows n"]) -> list[Float[Array, "windows n"]]:
         """Initial states to begin from beside those of a fit: none, for every fit is close to the recorded motion."""
         return [delta]
 
-    def begin_around(self, p: Float[Array, " k"]) -> None:
-        """Linearize around the θ of a point; what a fit finds then does not depend on the fits before it."""
-        key = np.asarray(p)[: self.d].tobytes()
-        if self._home is None or self._home[0] != key:
-            self._around = {}
-            self._home = key, self._linearized(Candidate(), np.asarray(p), self.motion)
-        self._around = {False: self._home[1]}
+    def begin_around(self, candidate: Candidate, p: Float[Array, " k"] | np.ndarray) -> None:
+        """Linearize the steps around a candidate's point, for the fits that follow.
+
+        They move the simulator's parameters and effects on the model: where the steps lead is found anew then, and what
+        becomes of deviations from there is taken from here. It errs by products of the two, for each candidate alike.
+        """
+        steps = self._steps(candidate)
+        senses = [place for k, place in self.offsets(candidate) if self.pairs[k][0].port == "sense"]
+        x = np.asarray(p)
+        key = (self._edits(candidate), np.where(steps, x, 0.0).tobytes(), tuple(x[s].tobytes() for s in senses))
+        if key not in self._homes:
+            if len(self._homes) >= HOMES:
+                del self._homes[next(iter(self._homes))]
+            self._homes[key] = self._linearize(candidate, x)
+        self._base = self._recent = self._homes[key]
+
+    def approach(self, candidate: Candidate, p: Float[Array, " k"] | np.ndarray) -> None:
+        """The same where a candidate's point is far from where the steps are linearized."""
+        assert self._base is not None
+        senses = any(self.pairs[k][0].port == "sense" for k in candidate.effects)
+        if senses or self._base.edits != self._edits(candidate) or self._is_far(candidate, np.asarray(p), self._base):
+            self.begin_around(candidate, p)
+
+    def _edits(self, candidate: Candidate) -> tuple[tuple[int, int], ...]:
+        """A candidate's effects on the model, and where the parameters of each begin in p."""
+        return tuple((k, place.start) for k, place in self.offsets(candidate) if k in self.edits)
+
+    def _is_far(self, candidate: Candidate, p: Float[np.ndarray, " k"], around: _Around) -> bool:
+        """Whether a point's steps lead elsewhere than derivatives there tell."""
+        return bool(np.abs(p - around.p)[self._steps(candidate)].max(initial=0.0) >= MOVED)
 
     def _steps(self, candidate: Candidate) -> Bool[np.ndarray, " k"]:
         """What of p changes the steps themselves: θ, and parameters of effects on the model."""
@@ -147,45 +185,63 @@ class Scene(CandidatesOf):
             found[place] = k in self.edits
         return found
 
-    def _full(self, candidate: Candidate, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The argument of `numbers`, and what of it p moves: θ, and the rest where the candidate edits the model."""
-        edits = any(k in self.edits for k in candidate.effects)
-        k = self.d + (self.slots if edits else 0)
+    def _full(self, candidate: Candidate, p: Float[np.ndarray, " k"]) -> Float[np.ndarray, " m"]:
+        """The argument of `numbers`."""
         if self.edited is None:
-            return p[: self.d], np.eye(self.d)
+            return p[: self.d]
         first = dict(zip(self.edits, np.cumsum([0, *(len(self.parameters[e]) for e in self.edits)]), strict=False))
         flat = [(q, m) for e in self.edits for q, m in zip(self.parameters[e], self.margin[e], strict=True)]
-        m = len(flat)
-        x, on = np.zeros(m), np.zeros(m)
-        along = np.zeros((k, self.d + 5 * m))
-        along[: self.d, : self.d] = np.eye(self.d)
+        x, on = np.zeros(len(flat)), np.zeros(len(flat))
         for e, place in self.offsets(candidate):
             if e in first:
                 own = slice(int(first[e]), int(first[e]) + len(self.parameters[e]))
                 x[own], on[own] = p[place], 1.0
-                along[range(place.start, place.stop), range(self.d + own.start, self.d + own.stop)] = 1.0
         low, high = ([getattr(mm, side) for _, mm in flat] for side in ("a", "b"))
         neutral = [q.neutral for q, _ in flat]
-        parts = (p[: self.d], x, on, *(np.asarray(v, float) for v in (low, high, neutral)))
-        return np.concatenate(parts), along
+        return np.concatenate([p[: self.d], x, on, *(np.asarray(v, float) for v in (low, high, neutral))])
 
-    def _linearized(self, candidate: Candidate, p: np.ndarray, motion: Motion) -> _Around:
-        """Steps around the motion: those of before, where neither the motion nor the model has changed much.
-
-        Kept are the last ones without effects on the model, and the last ones with some.
-        """
-        edits = tuple((k, place.start) for k, place in self.offsets(candidate) if k in self.edits)
-        steps = self._steps(candidate)
-        kept = self._around.get(bool(edits))
-        if kept is not None and kept.edits == edits and kept.motion is motion:
-            moved = np.abs(p - kept.p)[steps]
-            if moved.max(initial=0.0) < MOVED:
-                return kept
-        full, along = self._full(candidate, p)
+    def _linearize(self, candidate: Candidate, p: Float[np.ndarray, " k"]) -> _Around:
+        """Steps linearized around the motion behind what the sensors showed."""
+        motion, _ = self._restored(candidate, p)
+        full = self._full(candidate, p)
+        along = np.eye(self.d, full.size)
         lin = linearize_steps(self.engine, self.numbers, motion, full, along, self.system.substeps, self.step)
-        around = _Around(edits, np.where(steps, p, 0.0), motion, lin, self._windowed(p, motion))
+        return self._step_from(candidate, p, motion, lin, respond(lin, self._windowed(p, motion), self.d))
+
+    def _step_from(
+        self,
+        candidate: Candidate,
+        p: Float[np.ndarray, " k"],
+        motion: Motion,
+        lin: Linearized,
+        shared: Float[Array, "windows dn rowsobs"],
+    ) -> _Around:
+        """Where the steps lead at a point, with the derivatives of steps linearized elsewhere."""
+        moves = [i for k, place in self.offsets(candidate) if k in self.edits for i in range(place.start, place.stop)]
+        points = [self._full(candidate, p + self.length * (np.arange(p.size) == i)) for i in moves]
+        rest = [self._full(candidate, p)] * (1 + self.slots - len(points))
+        every, count = np.stack([rest[0], *points, *rest[1:]]), 1 + len(points)
+        gap, own = find_gap(self.engine, self.numbers, motion, every, count, self.length, self.system.substeps)
+        places = np.full(self.slots, self.d + self.slots)
+        places[: len(moves)] = moves
+        along = _put_along(lin.along, own, places, self.d + self.slots)
+        kept = np.where(self._steps(candidate), p, 0.0)
+        found = Linearized(lin.a, lin.b, along, gap)
+        return _Around(self._edits(candidate), kept, motion, found, self._windowed(p, motion), shared)
+
+    def _find_around(self, candidate: Candidate, p: Float[np.ndarray, " k"], motion: Motion) -> _Around:
+        """Steps around the motion: those of before, where neither the motion nor the model has changed much."""
+        if self._base is None:
+            self.begin_around(candidate, p)
+        for kept in (self._recent, self._base):
+            assert kept is not None
+            alike = kept.motion is motion and kept.edits == self._edits(candidate)
+            if alike and not self._is_far(candidate, p, kept):
+                return kept
+        assert self._base is not None
+        around = self._step_from(candidate, p, motion, self._base.lin, self._base.shared)
         if motion is self.motion:
-            self._around[bool(edits)] = around
+            self._recent = around
         return around
 
     def _windowed(self, p: np.ndarray, motion: Motion) -> Windowed:
@@ -201,7 +257,7 @@ class Scene(CandidatesOf):
     def _restored(self, candidate: Candidate, p: np.ndarray) -> tuple[Motion, list[tuple[Any, ...]]]:
         """The true motion behind what sensors with effects showed.
 
-        Of every reading: channel, degree of freedom, ∂q/∂x, ∂v/∂x, ∂q/∂reading, place in p.
+        Of every reading: channel, degree of freedom, ∂q/∂x, ∂v/∂x, ∂q/∂reading, first of x among own numbers.
         """
         motion, readings = self.motion, []
         for k, place in self.offsets(candidate):
@@ -223,11 +279,11 @@ class Scene(CandidatesOf):
             else:
                 qvel = qvel.at[..., v].set(new_v)
             motion = dataclasses.replace(motion, qpos=qpos, qvel=qvel)
-            readings.append((channels.index(at(name)), v, along, along_v, slope, place.start))
+            readings.append((channels.index(at(name)), v, along, along_v, slope, place.start - self.d))
         return motion, readings
 
     def _pushes(self, e: int, p: np.ndarray, place: slice, around: _Around) -> list[tuple[Any, ...]]:
-        """What an effect exerts: degree of freedom, force, derivatives along x, place of x in p."""
+        """What an effect exerts: degree of freedom, force, derivatives along x, first of x among own numbers."""
         effect, site = self.pairs[e][0], self.sites[e]
         if effect.port not in ("force", "act"):
             return []
@@ -238,14 +294,14 @@ class Scene(CandidatesOf):
             earlier = self._earlier(site.joint, around) if effect.recalls else None
             seen = (self.h, self.fine, x, low, high, self.times, joint, other, earlier, self.system.dt)
             f, along = force_of(effect, kinds, site.detail, *seen)
-            return [(self._dof(site.joint), f, along, place.start)]
+            return [(self._dof(site.joint), f, along, place.start - self.d)]
         gains = self._gains(site.actuators, around)
         commands, older, coarse, before = self._commands(site.actuators, effect.looks)
         f, along = commands_of(
             effect, kinds, self.h, self.fine, before, coarse, x, low, high, self.times, joint, commands, older, gains
         )
         return [
-            (self._dof(int(self.model.actuator_trnid[actuator, 0])), f[..., i], along[..., i, :], place.start)
+            (self._dof(int(self.model.actuator_trnid[actuator, 0])), f[..., i], along[..., i, :], place.start - self.d)
             for i, actuator in enumerate(site.actuators)
         ]
 
@@ -357,6 +413,19 @@ class _EngineNumbers:
 def _device(x: np.ndarray) -> Array:
     """Where programs take it from without a copy, and without a program of its own."""
     return jax.device_put(x.astype(jnp.result_type(float)))
+
+
+@partial(jax.jit, static_argnames="size", compiler_options=COMPILER_OPTIONS)
+def _put_along(
+    theta: Float[Array, "windows steps n d"],
+    own: Float[Array, "windows steps n e"],
+    places: Int[Array, " e"],
+    size: int,
+) -> Float[Array, "windows steps n k"]:
+    """Derivatives along θ's z, and along effects on the model in their places; a place beyond the last is none."""
+    d = size - places.size
+    padded = jnp.pad(theta[..., :d], [(0, 0)] * 3 + [(0, size - d)])
+    return padded.at[..., places].set(own, mode="drop")
 
 
 @partial(jax.jit, static_argnames=("place", "actuators", "fine"), compiler_options=COMPILER_OPTIONS)

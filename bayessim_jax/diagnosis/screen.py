@@ -7,6 +7,7 @@ hundredths of a second, so that pairs are tried as well. What comes out on top i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, product
 from typing import Any
@@ -89,12 +90,12 @@ class Screen:
         return Screen(self.scene.twin())
 
     def starts(self, candidate: Candidate) -> list[np.ndarray]:
-        """Points of a candidate's x to begin from: its start values, mirrored where a sign is open, and draws."""
+        """Points of a candidate's x to begin from: its start values, mirrored where a sign is open, weak, and draws."""
         random = np.random.default_rng(candidate.effects)
         parameters, margin = self.scene.parameters, self.scene.margin
         each = [(p, m) for k in candidate.effects for p, m in zip(parameters[k], margin[k], strict=True)]
-        begin = self._begin(candidate)
-        points = [begin]
+        begin, weak = self._begin(candidate), self._begin(candidate, NEAR)
+        points = [begin, weak] if np.abs(begin - weak).max(initial=0.0) > 1e-9 else [begin]
         signs = np.array([-1.0 if p.low < 0.0 else 1.0 for p, _ in each])
         if (signs < 0.0).any():
             points.append(signs * begin)
@@ -111,7 +112,7 @@ class Screen:
                 point[k] = z
             points.append(point)
         if len(each) == 1 and not grids:
-            points += [np.array([-ASIDE]), np.array([ASIDE])]
+            points += [np.array([ASIDE]), *([np.array([-ASIDE])] if len(points) == 1 else [])]
         if len(each) > 1:
             points += [random.standard_normal(len(each)) for _ in range(DRAWS)]
         return points
@@ -167,7 +168,9 @@ class Screen:
     ) -> Screened | None:
         """Fit a candidate and its noise in turn, and score it."""
         own = self.scene.count(candidate)
+        self.scene.begin_around(candidate, p)
         for steps in (iterations, AGAIN):
+            self.scene.approach(candidate, p)
             p, delta, curvature, r, _ = self.fit(candidate, p, delta, sigma, steps)
             if curvature is None:
                 return None
@@ -191,22 +194,39 @@ class Screen:
         return found
 
     def begin_candidate(self, candidate: Candidate, known: Screened) -> Begun | None:
-        """Fit a candidate from several points beside a fit without it; `known` may hold some of its effects already."""
-        self.scene.begin_around(known.p)
+        """Take the first steps with a candidate from several points beside a fit without it.
+
+        `known` may hold some of its effects already.
+        """
+        self.scene.begin_around(known.candidate, known.p)
         added = Candidate(tuple(k for k in candidate.effects if k not in known.candidate.effects))
         points = [self._put(added, known, start) for start in self.starts(added)]
         strayed = (np.arange(self.d + self.slots) < self.d) & (np.abs(known.p) > STRAYED)
         if strayed.any():
             points += [np.where(strayed, 0.0, point) for point in points]
         ends: list[tuple[Any, ...]] = [(p, delta) for p in points for delta in self.scene.states(known.delta)]
-        weighs = any(p.unit in INERTIAS for k in added.effects for p in self.scene.parameters[k])
+        return self._race(candidate, known, ends, RACES[:1])
+
+    def resume_candidate(self, begun: Begun, known: Screened) -> Begun | None:
+        """Go on with a candidate from the best of those points."""
+        self.scene.begin_around(known.candidate, known.p)
+        return self._race(begun.candidate, known, begun.ends, RACES[1:])
+
+    def _race(
+        self,
+        candidate: Candidate,
+        known: Screened,
+        ends: list[tuple[Any, ...]],
+        races: Sequence[tuple[int, bool, int]],
+    ) -> Begun | None:
+        """Fit a candidate from several points, of which the best go on."""
+        added = [k for k in candidate.effects if k not in known.candidate.effects]
+        weighs = any(p.unit in INERTIAS for k in added for p in self.scene.parameters[k])
         bad = BAD * known.cost if weighs else np.inf
-        for steps, scanned, kept in RACES:
+        for steps, scanned, kept in races:
             tried = [self.fit(candidate, end[0], end[1], known.sigma, steps, scanned, bad) for end in ends]
             ends = sorted((end for end in tried if end[2] is not None), key=lambda end: float(end[2].cost))[:kept]
-        if not ends:
-            return None
-        return Begun(candidate, ends, self._profile(ends[0][3], known.sigma))
+        return Begun(candidate, ends, self._profile(ends[0][3], known.sigma)) if ends else None
 
     def _profile(self, r: Array, sigma: Array) -> float:
         """Log likelihood at the noise that residuals have, up to a constant."""
@@ -215,8 +235,11 @@ class Screen:
 
     def finish_candidate(self, begun: Begun, known: Screened) -> Screened | None:
         """Fit what was begun to the end, with its own noise, and score it."""
-        self.scene.begin_around(known.p)
-        ends = [self.fit(begun.candidate, end[0], end[1], known.sigma, LASTING) for end in begun.ends]
+        ends = []
+        for p, delta, *_ in begun.ends:
+            self.scene.begin_around(known.candidate, known.p)
+            self.scene.approach(begun.candidate, p)
+            ends.append(self.fit(begun.candidate, p, delta, known.sigma, LASTING))
         ends = [end for end in ends if end[2] is not None]
         if not ends:
             return None
@@ -234,6 +257,7 @@ class Screen:
 
     def misfit(self, key: PRNGKeyArray, found: Screened) -> Misfit:
         """What a candidate leaves of the misfit."""
+        self.scene.begin_around(found.candidate, found.p)
         _, r, slopes = self.scene.assess(found.candidate, np.asarray(found.p), found.delta, found.sigma)
         n = found.delta.shape[-1]
         own = in_units(np.asarray(slopes)[:, -n:], found.sigma)
@@ -249,7 +273,7 @@ class Screen:
 
         What is added begins nearly neutral, as usual, or as it was fitted `alone`.
         """
-        self.scene.begin_around(known.p)
+        self.scene.begin_around(known.candidate, known.p)
         added = Candidate(tuple(k for k in candidate.effects if k not in known.candidate.effects))
         costs = []
         for start in [self._begin(added, NEAR), self._begin(added), *([alone] if alone is not None else [])]:

@@ -99,8 +99,11 @@ class SimulatedScene(CandidatesOf):
         """Initial states to begin from: those of a fit, and the recorded ones, which no misfit has moved."""
         return [delta, jnp.zeros_like(delta)]
 
-    def begin_around(self, p: Float[Array, " k"]) -> None:
-        """Nothing is kept from fit to fit."""
+    def begin_around(self, candidate: Candidate, p: Float[Array, " k"] | np.ndarray) -> None:
+        """Nothing is linearized beforehand."""
+
+    def approach(self, candidate: Candidate, p: Float[Array, " k"] | np.ndarray) -> None:
+        """Neither here."""
 
 
 def _predict_chosen(bench: Bench) -> Any:

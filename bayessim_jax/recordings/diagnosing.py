@@ -364,6 +364,9 @@ def _fit_residual_force(key: Array, taken: _Taken, none: Entry) -> _Residual | N
     found = screen.settle(every, nothing.p, nothing.delta, nothing.sigma, iterations=LONG)
     if found is None:
         return None
+    # a screen with room for one of them is as many times faster
+    screen = screen if len(places) == 1 else problem.screen(pairs, FEATURES + len(UNITS))
+    nothing = dataclasses.replace(nothing, p=nothing.p[: screen.d + screen.slots])
     before, left = screen.misfit(key, nothing), []
     for k in range(len(places)):
         alone = screen.settle(Candidate((k,)), nothing.p, nothing.delta, nothing.sigma, iterations=LONG)

@@ -6,9 +6,18 @@ import numpy as np
 import pytest
 
 from bayessim_jax.diagnosis.forcing import Joint, commands_of, force_of, restore_readings
-from bayessim_jax.diagnosis.response import Forcing, Motion, Windowed, assess, linearize_steps, separate
+from bayessim_jax.diagnosis.response import (
+    Forcing,
+    Motion,
+    Windowed,
+    assess,
+    find_gap,
+    linearize_steps,
+    respond,
+    separate,
+)
 from bayessim_jax.effects import EFFECTS, Moment
-from bayessim_jax.systems.mjcf import displace, mjcf_system
+from bayessim_jax.systems.mjcf import Unknown, displace, mjcf_system
 
 DOUBLE = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
 <body><joint name="a" axis="0 1 0" damping="0.02"/><inertial pos="0 0 -0.2" mass="0.5" diaginertia="0.004 0.004 0.001"/>
@@ -61,7 +70,8 @@ def test_the_response_to_a_force_is_the_simulators_to_first_order(arm):
         none = jnp.zeros((1, STEPS + 1, 4))
         still = jnp.zeros((1, 4, 1))
         forcing = Forcing(size * push[None], jnp.zeros((1, STEPS, 2, 1)), none + 1.0, none, none[..., None], still)
-        _, r, _ = assess(lin, seen, forcing, jnp.zeros(1), jnp.zeros(1), jnp.zeros((1, 4)), jnp.ones(4))
+        shared = respond(lin, seen, 0)
+        _, r, _ = assess(lin, shared, seen, forcing, jnp.zeros(1), jnp.zeros(1), jnp.zeros((1, 4)), jnp.ones(4))
         errors.append(float(jnp.abs(r).max() / jnp.abs(moved - plain).max()))
     assert errors[1] < 1e-3
     assert errors[1] < 0.2 * errors[0]
@@ -75,6 +85,24 @@ def test_slopes_of_the_response_are_those_of_finite_differences(arm):
     central = linearize_steps(arm.engine, lambda x: x, motion, jnp.zeros(0), jnp.zeros((1, 0)), 2, 1e-5)
     for one, other in ((forward.a, central.a), (forward.b, central.b), (forward.gap, central.gap)):
         np.testing.assert_allclose(one, other, atol=1e-6)
+
+
+def test_where_steps_lead_is_found_without_linearizing_them():
+    arm = mjcf_system(DOUBLE, [Unknown("damping", ("joint/a/damping",), 0.0, 1.0)], substeps=2)
+    rng = np.random.default_rng(0)
+    qpos, qvel = (jnp.asarray(rng.normal(0, 0.1, (1, STEPS + 1, 2)).cumsum(1)) for _ in range(2))
+    motion = Motion(qpos, qvel, jnp.zeros((1, STEPS, 1)), jnp.zeros((1, 0, 1)), jnp.zeros(1))
+    for damping in (0.0, 0.2):
+        lin = linearize_steps(arm.engine, _same, motion, jnp.array([damping]), jnp.eye(1), 2, 0.0)
+        points = jnp.array([[damping], [damping + 1e-5], [np.nan]])
+        gap, slopes = find_gap(arm.engine, _same, motion, points, 2, 1e-5, 2)
+        np.testing.assert_allclose(gap, lin.gap, atol=1e-12)
+        np.testing.assert_allclose(slopes[..., :1], lin.along, rtol=1e-3, atol=1e-6)
+        assert (slopes[..., 1] == 0.0).all()
+
+
+def _same(x):
+    return x
 
 
 def test_separate_is_the_inverse_of_displace():
