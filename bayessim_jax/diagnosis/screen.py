@@ -90,12 +90,12 @@ class Screen:
         return Screen(self.scene.twin())
 
     def starts(self, candidate: Candidate) -> list[np.ndarray]:
-        """Points of a candidate's x to begin from: its start values, mirrored where a sign is open, weak, and draws."""
+        """Points of a candidate's x to begin from: its start values, mirrored where a sign is open, and draws."""
         random = np.random.default_rng(candidate.effects)
         parameters, margin = self.scene.parameters, self.scene.margin
         each = [(p, m) for k in candidate.effects for p, m in zip(parameters[k], margin[k], strict=True)]
-        begin, weak = self._begin(candidate), self._begin(candidate, NEAR)
-        points = [begin, weak] if np.abs(begin - weak).max(initial=0.0) > 1e-9 else [begin]
+        begin = self._begin(candidate)
+        points = [begin]
         signs = np.array([-1.0 if p.low < 0.0 else 1.0 for p, _ in each])
         if (signs < 0.0).any():
             points.append(signs * begin)
@@ -112,7 +112,7 @@ class Screen:
                 point[k] = z
             points.append(point)
         if len(each) == 1 and not grids:
-            points += [np.array([ASIDE]), *([np.array([-ASIDE])] if len(points) == 1 else [])]
+            points += [np.array([-ASIDE]), np.array([ASIDE])]
         if len(each) > 1:
             points += [random.standard_normal(len(each)) for _ in range(DRAWS)]
         return points
@@ -276,7 +276,9 @@ class Screen:
         self.scene.begin_around(known.candidate, known.p)
         added = Candidate(tuple(k for k in candidate.effects if k not in known.candidate.effects))
         costs = []
-        for start in [self._begin(added, NEAR), self._begin(added), *([alone] if alone is not None else [])]:
+        begin, weak = self._begin(added), self._begin(added, NEAR)
+        points = [weak, begin] if np.abs(begin - weak).max(initial=0.0) > 0.0 else [begin]
+        for start in [*points, *([alone] if alone is not None else [])]:
             p = self._put(added, known, start)
             found = self.fit(candidate, p, known.delta, known.sigma, GLANCING)
             costs.append(np.inf if found[2] is None else float(found[2].cost))
