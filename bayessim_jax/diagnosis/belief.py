@@ -19,16 +19,18 @@ def covariance_of(bench: Bench, entry: Entry) -> Float[np.ndarray, "k k"]:
 
     That of the fit, wide where windows disagree (`robust_covariance`), and for the number y = value(z) of an effect a
     variance (f y)² more, f its `EffectParameter.form`: recordings that fix a number to a thousandth fix it within one
-    form of its law.
+    form of its law. θ follows the number as the likelihood lets it: −H_θθ⁻¹ H_θx with H the fit's precision.
     """
-    size = bench.d + len(bench.columns(entry.candidate))
+    d = bench.d
+    size = d + len(bench.columns(entry.candidate))
     covariance = np.asarray(robust_covariance(entry.fit))[:size, :size].copy()
     values = np.array(list(bench.values(entry.candidate, entry.fit.z).values()))
     form = np.array([bench.parameters[i].form for i in bench.columns(entry.candidate)])
     # no wider than the prior, whose standard deviation is 1
     own = np.minimum(form * np.abs(values) / np.maximum(_slopes(bench, entry), 1e-12), 1.0)
-    covariance[range(bench.d, size), range(bench.d, size)] += own**2
-    return covariance
+    precision = np.asarray(entry.fit.precision)[:size, :size]
+    follow = np.concatenate([-np.linalg.solve(precision[:d, :d], precision[:d, d:]), np.eye(size - d)])
+    return covariance + (follow * own**2) @ follow.T
 
 
 def moments_of_effects(bench: Bench, entry: Entry) -> tuple[dict[str, float], dict[str, float]]:

@@ -62,6 +62,16 @@ def test_a_number_is_no_better_known_than_the_form_of_its_law(precision):
     assert covariance_of(bench, found)[0, 0] == pytest.approx(1.0 / precision)  # the system's own have no form
 
 
+def test_the_systems_parameters_follow_an_effect_whose_law_may_have_another_form():
+    """Where recordings fix x − z and little else of an effect's x and θ's z, errors of both are one."""
+    bench, found = Bench(), entry([0.1, -0.5], 1.0)
+    found.fit = found.fit.replace(precision=jnp.array([[1e8, -1e8], [-1e8, 1.01e8]]))
+    plain = np.linalg.inv(np.asarray(found.fit.precision))
+    wide = covariance_of(bench, found)
+    assert wide[1, 1] > 4.0 * plain[1, 1]
+    np.testing.assert_allclose(wide - plain, wide[1, 1] - plain[1, 1], rtol=1e-5)
+
+
 def test_parameters_of_candidates_that_tie_cannot_all_be_right():
     bench = Bench()
     first, second = entry([0.0, 0.0], 1e10), entry([1.0, 0.0], 1e10)
