@@ -32,7 +32,7 @@ __all__ = [
     "Windowed",
     "assess",
     "cross_validate",
-    "find_gap",
+    "find_gaps",
     "linearize_steps",
     "propose",
     "respond",
@@ -129,33 +129,26 @@ def _miss(engine: Any, substeps: int, row: tuple[Array, ...], move: Array, force
 
 
 @partial(jax.jit, static_argnames=("engine", "numbers", "substeps"), compiler_options=COMPILER_OPTIONS)
-def find_gap(
+def find_gaps(
     engine: Any,
     numbers: Any,
     motion: Motion,
-    points: Float[Array, "k+1 m"],
+    points: Float[Array, "k m"],
+    forces: Float[Array, "k nv"],
     count: int | Int[Array, ""],
-    length: float,
     substeps: int,
-) -> tuple[Float[Array, "windows steps n"], Float[Array, "windows steps n k"]]:
-    """Every row's step from the motion at a point, the first, and its derivatives towards others, `length` away.
+) -> Float[Array, "k windows steps n"]:
+    """Every row's step from the motion at several points, each under a force; only the first `count` are looked at."""
+    still = jnp.zeros(2 * engine.model.nv)
 
-    Of the points only the first `count` are looked at; derivatives towards the rest are 0.
-    """
-    nv = engine.model.nv
-
-    def gap(x: Float[Array, " m"]) -> Float[Array, "windows steps n"]:
-        inner, still = numbers(x), (jnp.zeros(2 * nv), jnp.zeros(nv))
-        return jax.vmap(jax.vmap(lambda *row: _miss(engine, substeps, row, *still, inner)))(*_rows(motion))
+    def gap(x: Float[Array, " m"], force: Float[Array, " nv"]) -> Float[Array, "windows steps n"]:
+        inner = numbers(x)
+        return jax.vmap(jax.vmap(lambda *row: _miss(engine, substeps, row, still, force, inner)))(*_rows(motion))
 
     def put(k: Array, every: Array) -> Array:
-        return every.at[k].set(gap(points[k]))
+        return every.at[k].set(gap(points[k], forces[k]))
 
-    empty = jnp.zeros((len(points), *motion.ctrl.shape[:2], 2 * nv))
-    every = jax.lax.fori_loop(0, count, put, empty)
-    slopes = (every[1:] - every[0]) / length
-    looked = (jnp.arange(1, len(points)) < count)[:, None, None, None]
-    return every[0], jnp.moveaxis(jnp.where(looked, slopes, 0.0), 0, -1)
+    return jax.lax.fori_loop(0, count, put, jnp.zeros((len(points), *motion.ctrl.shape[:2], still.size)))
 
 
 @partial(jax.jit, static_argnames=("engine", "numbers", "substeps", "step"), compiler_options=COMPILER_OPTIONS)

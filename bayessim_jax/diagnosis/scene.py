@@ -27,7 +27,7 @@ from bayessim_jax.diagnosis.response import (
     Motion,
     Windowed,
     assess,
-    find_gap,
+    find_gaps,
     linearize_steps,
     respond,
 )
@@ -218,16 +218,22 @@ class Scene(CandidatesOf):
     ) -> _Around:
         """Where the steps lead at a point, with the derivatives of steps linearized elsewhere."""
         moves = [i for k, place in self.offsets(candidate) if k in self.edits for i in range(place.start, place.stop)]
-        points = [self._full(candidate, p + self.length * (np.arange(p.size) == i)) for i in moves]
-        rest = [self._full(candidate, p)] * (1 + self.slots - len(points))
-        every, count = np.stack([rest[0], *points, *rest[1:]]), 1 + len(points)
-        gap, own = find_gap(self.engine, self.numbers, motion, every, count, self.length, self.system.substeps)
-        places = np.full(self.slots, self.d + self.slots)
-        places[: len(moves)] = moves
-        along = _put_along(lin.along, own, places, self.d + self.slots)
+        pushes = any(self.pairs[k][0].port in ("force", "act") for k in candidate.effects)
+        e, nv = len(moves), self.model.nv
+        own, push = 1 + np.arange(e), 1 + e + np.arange(nv)
+        points = np.tile(self._full(candidate, p), (1 + self.slots + nv, 1))
+        for row, i in zip(own, moves, strict=True):
+            points[row] = self._full(candidate, p + self.length * (np.arange(p.size) == i))
+        # forces that move a joint by about `length`
+        forces, size = np.zeros((len(points), nv)), self.length / np.maximum(np.asarray(_mobility(lin)), 1e-12)
+        forces[push, np.arange(nv)] = size
+        count = 1 + e + (nv if pushes else 0)
+        gaps = find_gaps(self.engine, self.numbers, motion, points, forces, count, self.system.substeps)
+        at, places = np.zeros(self.slots, int), np.full(self.slots, self.d + self.slots)
+        at[:e], places[:e] = own, moves
+        lin = _renew(lin, gaps, at, places, self.length, push, size, pushes, self.d)
         kept = np.where(self._steps(candidate), p, 0.0)
-        found = Linearized(lin.a, lin.b, along, gap)
-        return _Around(self._edits(candidate), kept, motion, found, self._windowed(p, motion), shared)
+        return _Around(self._edits(candidate), kept, motion, lin, self._windowed(p, motion), shared)
 
     def _find_around(self, candidate: Candidate, p: Float[np.ndarray, " k"], motion: Motion) -> _Around:
         """Steps around the motion: those of before, where neither the motion nor the model has changed much."""
@@ -415,17 +421,36 @@ def _device(x: np.ndarray) -> Array:
     return jax.device_put(x.astype(jnp.result_type(float)))
 
 
-@partial(jax.jit, static_argnames="size", compiler_options=COMPILER_OPTIONS)
-def _put_along(
-    theta: Float[Array, "windows steps n d"],
-    own: Float[Array, "windows steps n e"],
+@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
+def _mobility(lin: Linearized) -> Float[Array, " nv"]:
+    """How fast a force on every degree of freedom makes it within a row, on average."""
+    nv = lin.b.shape[-1]
+    return jnp.abs(jnp.diagonal(lin.b[..., nv:, :], axis1=-2, axis2=-1)).mean((0, 1))
+
+
+@partial(jax.jit, static_argnames="d", compiler_options=COMPILER_OPTIONS)
+def _renew(
+    lin: Linearized,
+    gaps: Float[Array, "k windows steps n"],
+    at: Int[Array, " e"],
     places: Int[Array, " e"],
-    size: int,
-) -> Float[Array, "windows steps n k"]:
-    """Derivatives along θ's z, and along effects on the model in their places; a place beyond the last is none."""
-    d = size - places.size
-    padded = jnp.pad(theta[..., :d], [(0, 0)] * 3 + [(0, size - d)])
-    return padded.at[..., places].set(own, mode="drop")
+    length: float,
+    push: Int[Array, " nv"],
+    size: Float[Array, " nv"],
+    pushes: bool,
+    d: int,
+) -> Linearized:
+    """Linearized steps that lead elsewhere: `gaps` at a point, `length` beside it, and under forces of some size.
+
+    The derivatives along effects on the model, `at` rows of `gaps`, go to their places beyond θ's; a place beyond the
+    last is none. Those along forces stay what they were where none `pushes`.
+    """
+    gap = gaps[0]
+    own = jnp.moveaxis((gaps[at] - gap) / length, 0, -1)
+    along = jnp.pad(lin.along[..., :d], [(0, 0)] * 3 + [(0, at.size)])
+    forced = jnp.moveaxis((gaps[push] - gap) / size[:, None, None, None], 0, -1)
+    along = along.at[..., places].set(own, mode="drop")
+    return Linearized(lin.a, jnp.where(pushes, forced, lin.b), along, gap)
 
 
 @partial(jax.jit, static_argnames=("place", "actuators", "fine"), compiler_options=COMPILER_OPTIONS)

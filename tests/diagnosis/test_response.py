@@ -11,7 +11,7 @@ from bayessim_jax.diagnosis.response import (
     Motion,
     Windowed,
     assess,
-    find_gap,
+    find_gaps,
     linearize_steps,
     respond,
     separate,
@@ -94,11 +94,13 @@ def test_where_steps_lead_is_found_without_linearizing_them():
     motion = Motion(qpos, qvel, jnp.zeros((1, STEPS, 1)), jnp.zeros((1, 0, 1)), jnp.zeros(1))
     for damping in (0.0, 0.2):
         lin = linearize_steps(arm.engine, _same, motion, jnp.array([damping]), jnp.eye(1), 2, 0.0)
-        points = jnp.array([[damping], [damping + 1e-5], [np.nan]])
-        gap, slopes = find_gap(arm.engine, _same, motion, points, 2, 1e-5, 2)
+        points = jnp.array([[damping], [damping + 1e-5], [damping], [np.nan]])
+        forces = jnp.zeros((4, 2)).at[2, 1].set(1e-4)
+        gap, beside, pushed, rest = find_gaps(arm.engine, _same, motion, points, forces, 3, 2)
         np.testing.assert_allclose(gap, lin.gap, atol=1e-12)
-        np.testing.assert_allclose(slopes[..., :1], lin.along, rtol=1e-3, atol=1e-6)
-        assert (slopes[..., 1] == 0.0).all()
+        np.testing.assert_allclose((beside - gap) / 1e-5, lin.along[..., 0], rtol=1e-3, atol=1e-6)
+        np.testing.assert_allclose((pushed - gap) / 1e-4, lin.b[..., 1], rtol=1e-3, atol=1e-6)
+        assert (rest == 0.0).all()
 
 
 def _same(x):
