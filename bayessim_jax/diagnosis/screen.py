@@ -54,8 +54,8 @@ class Begun:
     """A candidate fitted from several points, at the noise of a fit without it."""
 
     candidate: Candidate
-    ends: list[tuple[Any, ...]]
-    """(p, δ, curvature, residuals, slopes), the best first."""
+    ends: list[tuple[Any, Array]]
+    """(p, δ), the best first."""
     likelihood: float
     """Log likelihood of the best at its own noise, up to a constant."""
 
@@ -130,7 +130,7 @@ class Screen:
         """Levenberg-Marquardt from a point; parameters that are `scanned` may stay where they are.
 
         Where the point costs more than `bad`, the first step is θ's alone: a rotor takes from the mass that was fitted
-        without it. Returns (p, δ, curvature, residuals, slopes).
+        without it. Returns (p, δ, curvature, residuals).
         """
         system = np.arange(self.d + self.slots) < self.d
         free = np.arange(self.d + self.slots) < self.d + self.scene.count(candidate)
@@ -145,7 +145,7 @@ class Screen:
             cost = float(there[0].cost)
             if np.isfinite(cost) and (here is None or cost <= float(here[2].cost)):
                 gain = np.inf if here is None else (float(here[2].cost) - cost) / max(abs(cost), 1e-12)
-                here, damping = (*tried, *there), max(damping / 5, 1e-9)
+                here, damping = (*tried, *there[:2]), max(damping / 5, 1e-9)
                 if gain < 1e-4:
                     break
             elif here is None:
@@ -156,7 +156,7 @@ class Screen:
                 moving = system if k == 0 and cost > bad else free
                 p, delta = propose(here[2], damping, moving, self.shots.spread, *here[:2])
                 tried = (np.asarray(p), delta)
-        return here if here is not None else (p, delta, None, None, None)
+        return here if here is not None else (p, delta, None, None)
 
     def settle(
         self,
@@ -171,7 +171,7 @@ class Screen:
         self.scene.begin_around(candidate, p)
         for steps in (iterations, AGAIN):
             self.scene.approach(candidate, p)
-            p, delta, curvature, r, _ = self.fit(candidate, p, delta, sigma, steps)
+            p, delta, curvature, r = self.fit(candidate, p, delta, sigma, steps)
             if curvature is None:
                 return None
             squares = (np.asarray(r) ** 2).sum((0, 1)) * np.asarray(sigma) ** 2
@@ -204,7 +204,7 @@ class Screen:
         strayed = (np.arange(self.d + self.slots) < self.d) & (np.abs(known.p) > STRAYED)
         if strayed.any():
             points += [np.where(strayed, 0.0, point) for point in points]
-        ends: list[tuple[Any, ...]] = [(p, delta) for p in points for delta in self.scene.states(known.delta)]
+        ends = [(p, delta) for p in points for delta in self.scene.states(known.delta)]
         return self._race(candidate, known, ends, RACES[:1])
 
     def resume_candidate(self, begun: Begun, known: Screened) -> Begun | None:
@@ -216,17 +216,21 @@ class Screen:
         self,
         candidate: Candidate,
         known: Screened,
-        ends: list[tuple[Any, ...]],
+        ends: list[tuple[Any, Array]],
         races: Sequence[tuple[int, bool, int]],
     ) -> Begun | None:
         """Fit a candidate from several points, of which the best go on."""
         added = [k for k in candidate.effects if k not in known.candidate.effects]
         weighs = any(p.unit in INERTIAS for k in added for p in self.scene.parameters[k])
         bad = BAD * known.cost if weighs else np.inf
+        likelihood = -np.inf
         for steps, scanned, kept in races:
-            tried = [self.fit(candidate, end[0], end[1], known.sigma, steps, scanned, bad) for end in ends]
-            ends = sorted((end for end in tried if end[2] is not None), key=lambda end: float(end[2].cost))[:kept]
-        return Begun(candidate, ends, self._profile(ends[0][3], known.sigma)) if ends else None
+            tried = [self.fit(candidate, p, delta, known.sigma, steps, scanned, bad) for p, delta in ends]
+            best = sorted((end for end in tried if end[2] is not None), key=lambda end: float(end[2].cost))
+            if not best:
+                return None
+            ends, likelihood = [end[:2] for end in best[:kept]], self._profile(best[0][3], known.sigma)
+        return Begun(candidate, ends, likelihood)
 
     def _profile(self, r: Array, sigma: Array) -> float:
         """Log likelihood at the noise that residuals have, up to a constant."""
@@ -236,7 +240,7 @@ class Screen:
     def finish_candidate(self, begun: Begun, known: Screened) -> Screened | None:
         """Fit what was begun to the end, with its own noise, and score it."""
         ends = []
-        for p, delta, *_ in begun.ends:
+        for p, delta in begun.ends:
             self.scene.begin_around(known.candidate, known.p)
             self.scene.approach(begun.candidate, p)
             ends.append(self.fit(begun.candidate, p, delta, known.sigma, LASTING))
