@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from itertools import count
+from itertools import count, islice
 from typing import Any, TypeVar
 from zlib import crc32
 
@@ -520,8 +520,8 @@ def _finish(
 
         fresh = [e for e in entries if e.candidate not in before]
         left = [e for e in fresh if e.misfit.p_value < FALSE_ALARMS and len(bench.columns(e.candidate)) > SIMPLE]
-        left = [e for e in left if falls_short(e)]
-        _replace(work, entries, zip(left, pool.map(from_usual, left[:AGAIN]), strict=False))
+        again = list(islice(filter(falls_short, left), AGAIN))
+        _replace(work, entries, zip(again, pool.map(from_usual, again), strict=True))
         for _ in range(TURNS if entries else 0):
             best = entries[0]
             rivals = [entry for entry in entries if _are_rivals(entry, best, none, thresholds)][:AGAIN]
