@@ -7,6 +7,8 @@ from pathlib import Path
 
 import jax
 
+from bayessim_jax.programs import keep_traces_in
+
 __all__ = ["use_compilation_cache"]
 
 
@@ -25,4 +27,5 @@ def use_compilation_cache() -> Path | None:
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+    keep_traces_in(folder / "traced")
     return folder

@@ -24,6 +24,7 @@ from bayessim_jax.effects import EffectParameter, Scales, at, with_effects
 from bayessim_jax.effects.attach import wire
 from bayessim_jax.inference.replay import Inputs, Restarted, replay_window
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS, DAMPING, Fit, Shots, predict_all, solve
+from bayessim_jax.programs import trace_once
 from bayessim_jax.systems.mjcf import MjcfSystem, system_key
 
 __all__ = ["NEAR", "SLOTS", "Bench", "Candidate", "CandidatesOf", "begin_point", "begin_value", "margin_of_effect"]
@@ -235,10 +236,8 @@ class Bench:
         damping: float | Scalar = DAMPING,
     ) -> Fit:
         """Fit a candidate from a point."""
-        used, shots = self.used(candidate), self.setup(candidate)
-        start = (np.asarray(x)[:used], delta, sigma, np.ones(used, bool))
-        fit = solve(self.simulator(candidate), shots, *start, steps=steps, step=self.step, damping=damping)
-        return fit.widen(self.size)
+        start, how = (x, delta, sigma, self.free(candidate)), {"steps": steps, "step": self.step, "damping": damping}
+        return solve(self.simulator(candidate), self.setup(candidate), *start, **how, live=self.used(candidate))
 
     def replay(
         self, candidate: Candidate, x: Float[Array, " k"], shots: Shots, delta: Float[Array, " n"] | float = 0.0
@@ -280,4 +279,4 @@ def begin_value(p: EffectParameter, share: float = 1.0) -> float:
     return p.neutral + share * (p.start - p.neutral) if grows and share < 1.0 else p.start
 
 
-_replay = jax.jit(predict_all, static_argnames="predict", compiler_options=COMPILER_OPTIONS)
+_replay = trace_once(predict_all, static_argnames="predict", compiler_options=COMPILER_OPTIONS)

@@ -6,7 +6,6 @@ and the programs know no model: another machine finds them in the compilation ca
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import jax
@@ -17,9 +16,12 @@ from jaxtyping import Array, Float
 from bayessim_jax.beliefs.margins import Margin
 from bayessim_jax.effects import Moment
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS
+from bayessim_jax.programs import trace_once
 
 __all__ = ["Joint", "Kinds", "force_of", "restore_readings", "commands_of"]
 
+MANY = 12
+"""Parameters from which on reverse-mode derivatives of every moment's force cost less than forward-mode ones."""
 Kinds = tuple[tuple[str, str], ...]
 """Name and kind of margin of every parameter of an effect."""
 
@@ -44,9 +46,7 @@ def _values(kinds: Kinds, x: Array, low: Array, high: Array) -> dict[str, Array]
     return {name: Margin(kind, 0.0, 1.0).between(low[k], high[k]).value(x[k]) for k, (name, kind) in enumerate(kinds)}
 
 
-@partial(
-    jax.jit, static_argnames=("effect", "kinds", "detail", "h", "steps", "period"), compiler_options=COMPILER_OPTIONS
-)
+@trace_once(static_argnames=("effect", "kinds", "detail", "h", "steps", "period"), compiler_options=COMPILER_OPTIONS)
 def force_of(
     effect: Any,
     kinds: Kinds,
@@ -64,18 +64,24 @@ def force_of(
 ) -> tuple[Float[Array, "windows rows"], Float[Array, "windows rows k"]]:
     """Mean force of a `ForceEffect` in every row of so many time steps, and its derivatives along x.
 
+    An effect of many parameters remembers nothing.
+
     `earlier` are positions, velocities and what actuators exerted before the windows, every `period` s, for one that
     remembers them.
     """
+
+    def moment(time: Array, joint: Joint, other: Joint | None) -> Moment:
+        beside = None if other is None else other.moment(time, h)
+        return joint.moment(time, h)._replace(detail=detail, other=beside)
+
+    def instant(x: Array, *now: Any) -> Array:
+        values = _values(kinds, x, low, high)
+        return effect.force(values, effect.begin(values, moment(*now)), moment(*now))[0]
 
     def force(x: Array) -> Array:
         values = _values(kinds, x, low, high)
 
         def window(time: Array, joint: Joint, other: Joint | None, earlier: Any) -> Array:
-            def moment(time: Array, joint: Joint, other: Joint | None) -> Moment:
-                beside = None if other is None else other.moment(time, h)
-                return joint.moment(time, h)._replace(detail=detail, other=beside)
-
             def once(memory: Any, now: Any) -> tuple[Any, Array]:
                 f, memory = effect.force(values, memory, moment(*now))
                 return memory, f * jnp.ones(())
@@ -91,12 +97,13 @@ def force_of(
 
         return jax.vmap(window)(time, joint, other, earlier)
 
-    return _with_slopes(force, x)
+    if x.size <= MANY:
+        return _with_slopes(force, x)
+    each = jax.vmap(jax.vmap(jax.value_and_grad(instant), (None, 0, 0, 0)), (None, 0, 0, 0))
+    return jax.tree.map(lambda f: f.reshape(len(time), -1, steps, *f.shape[2:]).mean(2), each(x, time, joint, other))
 
 
-@partial(
-    jax.jit, static_argnames=("effect", "kinds", "h", "steps", "before", "coarse"), compiler_options=COMPILER_OPTIONS
-)
+@trace_once(static_argnames=("effect", "kinds", "h", "steps", "before", "coarse"), compiler_options=COMPILER_OPTIONS)
 def commands_of(
     effect: Any,
     kinds: Kinds,
@@ -154,7 +161,7 @@ def commands_of(
     return _with_slopes(change, x)
 
 
-@partial(jax.jit, static_argnames=("effect", "kinds", "period", "prompt"), compiler_options=COMPILER_OPTIONS)
+@trace_once(static_argnames=("effect", "kinds", "period", "prompt"), compiler_options=COMPILER_OPTIONS)
 def restore_readings(
     effect: Any,
     kinds: Kinds,

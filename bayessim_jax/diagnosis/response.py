@@ -23,17 +23,20 @@ from jaxtyping import Array, Bool, Float, Int
 
 from bayessim_jax.contracts import Scalar
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Curvature, eliminate, normal_equations
+from bayessim_jax.programs import trace_once
 from bayessim_jax.systems.mjcf import displace
 
 __all__ = [
+    "Beside",
     "Forcing",
     "Linearized",
     "Motion",
+    "Ways",
     "Windowed",
     "assess",
     "cross_validate",
+    "differ",
     "find_gaps",
-    "linearize_steps",
     "propose",
     "respond",
 ]
@@ -128,65 +131,69 @@ def _miss(engine: Any, substeps: int, row: tuple[Array, ...], move: Array, force
     return jnp.concatenate([separate(engine.model, q_next, engine.qpos(after)), engine.qvel(after) - v_next])
 
 
-@partial(jax.jit, static_argnames=("engine", "numbers", "substeps"), compiler_options=COMPILER_OPTIONS)
-def find_gaps(
-    engine: Any,
-    numbers: Any,
-    motion: Motion,
-    points: Float[Array, "k m"],
-    forces: Float[Array, "k nv"],
-    count: int | Int[Array, ""],
-    substeps: int,
-) -> Float[Array, "k windows steps n"]:
-    """Every row's step from the motion at several points, each under a force; only the first `count` are looked at."""
-    still = jnp.zeros(2 * engine.model.nv)
+@struct.dataclass
+class Beside:
+    """Points beside a motion from which steps are taken: k of them, the first is the motion itself."""
 
-    def gap(x: Float[Array, " m"], force: Float[Array, " nv"]) -> Float[Array, "windows steps n"]:
+    x: Float[Array, "k m"]
+    """`numbers(x)` is the engine's θ."""
+    move: Float[Array, "k n"]
+    """Of the state."""
+    force: Float[Array, "k nv"]
+
+
+@trace_once(static_argnames=("engine", "numbers", "substeps"), compiler_options=COMPILER_OPTIONS)
+def find_gaps(
+    engine: Any, numbers: Any, motion: Motion, beside: Beside, count: int | Int[Array, ""], substeps: int
+) -> Float[Array, "k windows steps n"]:
+    """Where every row's step leads from several points, less the next row; only the first `count` are looked at."""
+
+    def gap(x: Float[Array, " m"], move: Float[Array, " n"], force: Float[Array, " nv"]) -> Array:
         inner = numbers(x)
-        return jax.vmap(jax.vmap(lambda *row: _miss(engine, substeps, row, still, force, inner)))(*_rows(motion))
+        return jax.vmap(jax.vmap(lambda *row: _miss(engine, substeps, row, move, force, inner)))(*_rows(motion))
 
     def put(k: Array, every: Array) -> Array:
-        return every.at[k].set(gap(points[k], forces[k]))
+        return every.at[k].set(gap(beside.x[k], beside.move[k], beside.force[k]))
 
-    return jax.lax.fori_loop(0, count, put, jnp.zeros((len(points), *motion.ctrl.shape[:2], still.size)))
+    shape = (len(beside.x), *motion.ctrl.shape[:2], 2 * engine.model.nv)
+    return jax.lax.fori_loop(0, count, put, jnp.zeros(shape))
 
 
-@partial(jax.jit, static_argnames=("engine", "numbers", "substeps", "step"), compiler_options=COMPILER_OPTIONS)
-def linearize_steps(
-    engine: Any,
-    numbers: Any,
-    motion: Motion,
-    x: Float[Array, " m"],
-    along: Float[Array, "k m"],
-    substeps: int,
-    step: float,
+@struct.dataclass
+class Ways:
+    """Which of the points lie along what; a way has its point ahead, and one behind if differences are central."""
+
+    width: Float[Array, " w"]
+    """Between the two, or from the motion to the one ahead."""
+    own: Int[Array, " e"]
+    """Ways along a candidate's own parameters, and the places of these among p; a place beyond the last is none."""
+    places: Int[Array, " e"]
+    force: Int[Array, " nv"]
+    state: Int[Array, " n"]
+    theta: Int[Array, " d"]
+
+
+@partial(jax.jit, static_argnames="central", compiler_options=COMPILER_OPTIONS)
+def differ(
+    lin: Linearized | None, gaps: Float[Array, "k windows steps n"], ways: Ways, forced: bool, central: bool
 ) -> Linearized:
-    """Every row's step around the motion at a point x, with derivatives along some directions of it.
+    """Linearized steps by differences of `gaps`.
 
-    `numbers(x)` is the engine's θ. Forward-mode derivatives, or central differences of length `step`.
+    With `lin` only what a candidate's own parameters do is new, and what forces do if it is `forced`; the rest is as
+    it was linearized elsewhere.
     """
-    nv = engine.model.nv
-    inner, inner_along = numbers(x), jax.vmap(lambda v: jax.jvp(numbers, (x,), (v,))[1])(along)
+    gap = gaps[0]
+    ahead, behind = (gaps[1::2], gaps[2::2]) if central else (gaps[1:], gap[None] + jnp.zeros((len(gaps) - 1, 1, 1, 1)))
 
-    def one(*row: Array) -> tuple[Array, ...]:
-        advance = partial(_miss, engine, substeps, row)
-        point = (jnp.zeros(2 * nv), jnp.zeros(nv), inner)
-        size = 3 * nv + len(along)
-        directions = (
-            jnp.zeros((size, 2 * nv)).at[: 2 * nv].set(jnp.eye(2 * nv)),
-            jnp.zeros((size, nv)).at[2 * nv : 3 * nv].set(jnp.eye(nv)),
-            jnp.zeros((size, inner.size)).at[3 * nv :].set(inner_along),
-        )
-        if step:
-            moved = lambda d, s: advance(*jax.tree.map(lambda p, m: p + s * step * m, point, d))  # noqa: E731
-            slopes = jax.vmap(lambda d: (moved(d, 1.0) - moved(d, -1.0)) / (2 * step))(directions)
-            gap = advance(*point)
-        else:
-            gap, slopes = jax.vmap(lambda d: jax.jvp(advance, point, d), out_axes=(None, 0))(directions)
-        slopes = slopes.T
-        return slopes[:, : 2 * nv], slopes[:, 2 * nv : 3 * nv], slopes[:, 3 * nv :], gap
+    def slopes(rows: Int[Array, " r"]) -> Float[Array, "windows steps n r"]:
+        return jnp.moveaxis((ahead[rows] - behind[rows]) / ways.width[rows, None, None, None], 0, -1)
 
-    return Linearized(*jax.vmap(jax.vmap(one))(*_rows(motion)))
+    theta = slopes(ways.theta) if lin is None else lin.along[..., : ways.theta.size]
+    along = jnp.pad(theta, [(0, 0)] * 3 + [(0, ways.own.size)])
+    along = along.at[..., ways.places].set(slopes(ways.own), mode="drop")
+    if lin is None:
+        return Linearized(slopes(ways.state), slopes(ways.force), along, gap)
+    return Linearized(lin.a, jnp.where(forced, slopes(ways.force), lin.b), along, gap)
 
 
 def _propagate(a: Array, first: Float[Array, "n k"], added: Float[Array, "steps n k"]) -> Float[Array, "rows n k"]:

@@ -16,19 +16,21 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from bayessim_jax.beliefs.margins import Margin, Margins
 from bayessim_jax.diagnosis.bench import SLOTS, Candidate, CandidatesOf, margin_of_effect
 from bayessim_jax.diagnosis.forcing import Joint, commands_of, force_of, restore_readings
 from bayessim_jax.diagnosis.response import (
+    Beside,
     Forcing,
     Linearized,
     Motion,
+    Ways,
     Windowed,
     assess,
+    differ,
     find_gaps,
-    linearize_steps,
     respond,
 )
 from bayessim_jax.effects import Scales, at, with_effects
@@ -202,38 +204,50 @@ class Scene(CandidatesOf):
 
     def _linearize(self, candidate: Candidate, p: Float[np.ndarray, " k"]) -> _Around:
         """Steps linearized around the motion behind what the sensors showed."""
-        motion, _ = self._restored(candidate, p)
-        full = self._full(candidate, p)
-        along = np.eye(self.d, full.size)
-        lin = linearize_steps(self.engine, self.numbers, motion, full, along, self.system.substeps, self.step)
-        return self._step_from(candidate, p, motion, lin, respond(lin, self._windowed(p, motion), self.d))
+        return self._step_from(candidate, p, self._restored(candidate, p)[0])
 
     def _step_from(
-        self,
-        candidate: Candidate,
-        p: Float[np.ndarray, " k"],
-        motion: Motion,
-        lin: Linearized,
-        shared: Float[Array, "windows dn rowsobs"],
+        self, candidate: Candidate, p: Float[np.ndarray, " k"], motion: Motion, base: _Around | None = None
     ) -> _Around:
-        """Where the steps lead at a point, with the derivatives of steps linearized elsewhere."""
+        """Where the steps lead at a point; most derivatives are those of a `base`, if there is one."""
         moves = [i for k, place in self.offsets(candidate) if k in self.edits for i in range(place.start, place.stop)]
-        pushes = any(self.pairs[k][0].port in ("force", "act") for k in candidate.effects)
-        e, nv = len(moves), self.model.nv
-        own, push = 1 + np.arange(e), 1 + e + np.arange(nv)
-        points = np.tile(self._full(candidate, p), (1 + self.slots + nv, 1))
-        for row, i in zip(own, moves, strict=True):
-            points[row] = self._full(candidate, p + self.length * (np.arange(p.size) == i))
-        # forces that move a joint by about `length`
-        forces, size = np.zeros((len(points), nv)), self.length / np.maximum(np.asarray(_mobility(lin)), 1e-12)
-        forces[push, np.arange(nv)] = size
-        count = 1 + e + (nv if pushes else 0)
-        gaps = find_gaps(self.engine, self.numbers, motion, points, forces, count, self.system.substeps)
-        at, places = np.zeros(self.slots, int), np.full(self.slots, self.d + self.slots)
-        at[:e], places[:e] = own, moves
-        lin = _renew(lin, gaps, at, places, self.length, push, size, pushes, self.d)
-        kept = np.where(self._steps(candidate), p, 0.0)
-        return _Around(self._edits(candidate), kept, motion, lin, self._windowed(p, motion), shared)
+        forced = base is None or any(self.pairs[k][0].port in ("force", "act") for k in candidate.effects)
+        count, beside, ways = self._look_beside(candidate, p, moves, forced, base is None)
+        gaps = find_gaps(self.engine, self.numbers, motion, beside, count, self.system.substeps)
+        lin = differ(base.lin if base else None, gaps, ways, forced, self.step > 0.0)
+        kept, windowed = np.where(self._steps(candidate), p, 0.0), self._windowed(p, motion)
+        shared = base.shared if base else respond(lin, windowed, self.d)
+        return _Around(self._edits(candidate), kept, motion, lin, windowed, shared)
+
+    def _look_beside(
+        self, candidate: Candidate, p: Float[np.ndarray, " k"], moves: Sequence[int], forced: bool, whole: bool
+    ) -> tuple[int, Beside, Ways]:
+        """Points from which steps are taken, how many of them matter, and what they lie along.
+
+        Along a candidate's own parameters of the model; along forces where it is `forced`, of a size that moves a
+        velocity by about `length`; along the state and θ if the steps are linearized as a `whole`.
+        """
+        d, nv, m, length = self.d, self.model.nv, len(moves), self.length
+        rise = self.system.dt * np.maximum(self.model.dof_invweight0, 1e-12)
+        width = np.full(self.slots + 3 * nv + d, length)
+        width[m : m + nv] = length / rise
+        sides = (1.0, -1.0) if self.step else (1.0,)
+        points = np.tile(self._full(candidate, p), (1 + len(sides) * len(width), 1))
+        move, force = np.zeros((len(points), 2 * nv)), np.zeros((len(points), nv))
+        for k, side in enumerate(sides, 1):
+            rows = k + len(sides) * np.arange(len(width))
+            for row, i in zip(rows, moves, strict=False):
+                points[row] = self._full(candidate, p + side * length * (np.arange(p.size) == i))
+            force[rows[m : m + nv], np.arange(nv)] = side * width[m : m + nv]
+            move[rows[m + nv : m + 3 * nv], np.arange(2 * nv)] = side * length
+            points[rows[m + 3 * nv : m + 3 * nv + d], np.arange(d)] += side * length
+        own, places = np.zeros(self.slots, int), np.full(self.slots, d + self.slots)
+        own[:m], places[:m] = np.arange(m), moves
+        after = m + np.arange(3 * nv + d)
+        used = m + nv * forced + (2 * nv + d) * whole
+        beside = Beside(*(_device(x) for x in (points, move, force)))
+        ways = Ways(_device(len(sides) * width), own, places, after[:nv], after[nv : 3 * nv], after[3 * nv :])
+        return 1 + len(sides) * used, beside, ways
 
     def _find_around(self, candidate: Candidate, p: Float[np.ndarray, " k"], motion: Motion) -> _Around:
         """Steps around the motion: those of before, where neither the motion nor the model has changed much."""
@@ -245,7 +259,7 @@ class Scene(CandidatesOf):
             if alike and not self._is_far(candidate, p, kept):
                 return kept
         assert self._base is not None
-        around = self._step_from(candidate, p, motion, self._base.lin, self._base.shared)
+        around = self._step_from(candidate, p, motion, self._base)
         if motion is self.motion:
             self._recent = around
         return around
@@ -419,38 +433,6 @@ class _EngineNumbers:
 def _device(x: np.ndarray) -> Array:
     """Where programs take it from without a copy, and without a program of its own."""
     return jax.device_put(x.astype(jnp.result_type(float)))
-
-
-@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
-def _mobility(lin: Linearized) -> Float[Array, " nv"]:
-    """How fast a force on every degree of freedom makes it within a row, on average."""
-    nv = lin.b.shape[-1]
-    return jnp.abs(jnp.diagonal(lin.b[..., nv:, :], axis1=-2, axis2=-1)).mean((0, 1))
-
-
-@partial(jax.jit, static_argnames="d", compiler_options=COMPILER_OPTIONS)
-def _renew(
-    lin: Linearized,
-    gaps: Float[Array, "k windows steps n"],
-    at: Int[Array, " e"],
-    places: Int[Array, " e"],
-    length: float,
-    push: Int[Array, " nv"],
-    size: Float[Array, " nv"],
-    pushes: bool,
-    d: int,
-) -> Linearized:
-    """Linearized steps that lead elsewhere: `gaps` at a point, `length` beside it, and under forces of some size.
-
-    The derivatives along effects on the model, `at` rows of `gaps`, go to their places beyond θ's; a place beyond the
-    last is none. Those along forces stay what they were where none `pushes`.
-    """
-    gap = gaps[0]
-    own = jnp.moveaxis((gaps[at] - gap) / length, 0, -1)
-    along = jnp.pad(lin.along[..., :d], [(0, 0)] * 3 + [(0, at.size)])
-    forced = jnp.moveaxis((gaps[push] - gap) / size[:, None, None, None], 0, -1)
-    along = along.at[..., places].set(own, mode="drop")
-    return Linearized(lin.a, jnp.where(pushes, forced, lin.b), along, gap)
 
 
 @partial(jax.jit, static_argnames=("place", "actuators", "fine"), compiler_options=COMPILER_OPTIONS)

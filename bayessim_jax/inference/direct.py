@@ -31,6 +31,7 @@ from bayessim_jax.inference.shooting import (
     ridge,
     solve,
 )
+from bayessim_jax.programs import trace_once
 
 __all__ = ["estimate_noise", "fit_direct", "sample_direct"]
 
@@ -150,7 +151,7 @@ def _spreads(shots: Shots) -> np.ndarray:
     return np.array([max(float(x.std()), 1e-9) if x.size else 1.0 for x in columns])
 
 
-@partial(jax.jit, static_argnames="predict", compiler_options=COMPILER_OPTIONS)
+@trace_once(static_argnames="predict", compiler_options=COMPILER_OPTIONS)
 def _screen(predict: Predict, shots: Shots, points: Array, delta: Array, sigma: Array) -> Float[Array, " points"]:
     """Cost of every point, each residual counted as ten of its σ at most; not finite where the simulation is not."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import jax
@@ -11,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Predict, Ridge, Shots
+from bayessim_jax.programs import trace_once
 
 __all__ = [
     "Errors",
@@ -74,7 +74,7 @@ def predict_windows(
     return np.concatenate(found)[:windows]
 
 
-@partial(jax.jit, static_argnames="predict", compiler_options=COMPILER_OPTIONS)
+@trace_once(static_argnames="predict", compiler_options=COMPILER_OPTIONS)
 def _predict(predict: Predict, inputs: Any, z: Array, delta: Array) -> Float[Array, "windows rows obs"]:
     return jax.vmap(predict, in_axes=(None, 0, 0))(z, delta, inputs)
 

@@ -27,6 +27,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from bayessim_jax.contracts import Scalar
 from bayessim_jax.engines.batch import TASKS, WIDE
+from bayessim_jax.programs import trace_once
 
 __all__ = [
     "COMPILER_OPTIONS",
@@ -52,8 +53,8 @@ Predict = Callable[[Float[Array, " d"], Float[Array, " n"], Any], Float[Array, "
 
 
 TOLERANCE, ROUGH, DAMPING = 1e-7, 1e-4, 1e-3
-"""Of the solver: the share of the cost that it ends with, by derivatives and by differences, and the damping that it
-begins with."""
+"""Of the solver: the share of the cost that it ends with, where simulators are smooth and where not, and the damping
+that it begins with."""
 
 
 @struct.dataclass
@@ -136,24 +137,6 @@ class Fit:
             slopes=jnp.asarray(np.delete(slopes, np.s_[d : len(precision)], axis=1)),
         )
 
-    def widen(self, size: int) -> Fit:
-        """The same fit with more of z, which stay at zero and change nothing."""
-        d, (windows, _, k) = self.z.size, self.slopes.shape
-        more = size - d
-        if not more:
-            return self
-        slopes, precision = np.asarray(self.slopes), np.eye(size)
-        precision[:d, :d] = self.precision
-        return dataclasses.replace(
-            self,
-            z=jax.device_put(np.pad(np.asarray(self.z), (0, more))),
-            precision=jax.device_put(precision.astype(slopes.dtype)),
-            pulls=jax.device_put(np.pad(np.asarray(self.pulls), ((0, 0), (0, more)))),
-            slopes=jax.device_put(
-                np.concatenate([slopes[:, :d], np.zeros((windows, more, k), slopes.dtype), slopes[:, d:]], axis=1)
-            ),
-        )
-
     @property
     def along_states(self) -> Float[np.ndarray, "windows n k"]:
         """Derivatives of predictions along δ/S, in the channels' units."""
@@ -176,28 +159,33 @@ def predict_all(predict: Predict, shots: Shots, z: Array, delta: Array) -> Float
 
 
 def expand(
-    predict: Predict, shots: Shots, z: Array, delta: Array, sigma: Array, step: float = 0.0
+    predict: Predict, shots: Shots, z: Array, delta: Array, sigma: Array, step: float = 0.0, live: int | None = None
 ) -> tuple[Float[Array, "windows k"], Float[Array, "windows dn k"]]:
     """Residuals of every window and the derivatives of its predictions along (z, δ/S), both in units of σ.
 
-    Forward-mode derivatives; central differences of length `step` where it is not zero, for simulators that are not
-    differentiable.
+    Differences of length ε^⅓, with ε what numbers of this kind resolve: central ones along z, where a ridge must not
+    look informed, and forward ones along δ, which move far less than a simulator bends. Where it is not smooth all are
+    central, of length `step`. They and the point itself are one batch of simulations: the compiler meets a simulator
+    once, where forward-mode derivatives of it make a program several times as large (`docs/architecture.md`). Of z
+    only the first `live` matter to the simulator, all unless told.
     """
-    d, n, windows = z.size, delta.shape[-1], delta.shape[0]
-
-    def moved(along: Array, beside: Array) -> tuple[Array, Array]:
-        move = along, jnp.broadcast_to(beside, delta.shape)
-        if step:
-            ahead, behind = (predict_all(predict, shots, z + s * move[0], delta + s * move[1]) for s in (step, -step))
-            return predict_all(predict, shots, z, delta), (ahead - behind) / (2 * step)
-        return jax.jvp(partial(predict_all, predict, shots), (z, delta), move)
-
-    # directions outside and windows inside: z is common to all windows, and theirs lie side by side
-    move = jnp.eye(d + n, d), jnp.eye(d + n, n, -d) * shots.spread
-    value, slopes = jax.vmap(moved, out_axes=(None, 1))(*move)
+    d, n, windows = z.size if live is None else live, delta.shape[-1], delta.shape[0]
+    still = jnp.zeros(z.size - d, z.dtype)
+    length = step or float(jnp.finfo(z.dtype).eps) ** (1 / 3)
+    both = d + n if step else d
+    ways = length * jnp.concatenate([jnp.zeros((1, d + n)), jnp.eye(d + n), -jnp.eye(both, d + n)])
+    # points outside and windows inside: z is common to all windows, and theirs lie side by side
+    moved = lambda way: z + jnp.concatenate([way[:d], still])  # noqa: E731
+    run = lambda way: predict_all(predict, shots, moved(way), delta + way[d:] * shots.spread)  # noqa: E731
+    y = jax.vmap(run)(ways)
+    value, ahead, behind = y[0], y[1 : 1 + d + n], y[1 + d + n :]
+    slopes = [(ahead[:both] - behind) / (2 * length), (ahead[both:] - value) / length]
+    slopes = jnp.moveaxis(jnp.concatenate(slopes), 0, 1)
     r = jnp.where(shots.measured, (shots.y - value) / sigma, 0.0)
     slopes = jnp.where(shots.measured[:, None], slopes / sigma, 0.0)
-    return r.reshape(windows, -1), slopes.reshape(windows, d + n, -1)
+    slopes = slopes.reshape(windows, d + n, -1)
+    none = jnp.zeros((windows, still.size, slopes.shape[-1]), slopes.dtype)
+    return r.reshape(windows, -1), jnp.concatenate([slopes[:, :d], none, slopes[:, d:]], 1)
 
 
 def normal_equations(
@@ -333,7 +321,7 @@ def _arrive(march: _March, sigma: Array, terms: _Terms, shape: tuple[int, ...]) 
     )
 
 
-_look = jax.jit(expand, static_argnames=("predict", "step"), compiler_options=COMPILER_OPTIONS)
+_look = trace_once(expand, static_argnames=("predict", "step", "live"), compiler_options=COMPILER_OPTIONS)
 _go_on = jax.jit(_advance, compiler_options=COMPILER_OPTIONS)
 _end = jax.jit(_arrive, static_argnames="shape", compiler_options=COMPILER_OPTIONS)
 
@@ -349,8 +337,11 @@ def solve(
     steps: int = 30,
     step: float = 0.0,
     damping: float | Scalar = DAMPING,
+    live: int | None = None,
 ) -> Fit:
     """Levenberg-Marquardt on (z, δ₁, …, δ_W) from a starting point; z stays as it is where it is not `free`.
+
+    The simulator depends on the first `live` of z, on all unless told.
 
     A step that does not lower the cost, or leads to a number that is not finite, is refused and shortened; where the
     cost falls by less than a quarter of what the slopes promise, the next one is shorter, too. `damping` is where that
@@ -367,7 +358,7 @@ def solve(
     )
     march = _set_out(at, beside, shots.y.shape[1] * shots.y.shape[2], damping)
     for _ in range(int(steps)):
-        march = _go_on(march, _look(predict, shots, *march.tried, noise, step), terms)
+        march = _go_on(march, _look(predict, shots, *march.tried, noise, step, live), terms)
         small, last, cost = jax.device_get((march.small, march.damping, march.here.cost))
         if small >= 2 or last >= 1e9 or not np.isfinite(cost):
             break

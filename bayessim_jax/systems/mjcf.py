@@ -125,7 +125,20 @@ def system_key(system: Any) -> Hashable:
     leaves, structure = jax.tree.flatten(system)
     numbers = (jax.Array, np.ndarray, float, int)
     known = ((np.asarray(x).dtype.str, np.shape(x), np.asarray(x).tobytes()) for x in leaves if isinstance(x, numbers))
-    return structure, tuple(known), tuple(id(x) for x in leaves if not isinstance(x, numbers))
+    return structure, tuple(known), tuple(_Itself(x) for x in leaves if not isinstance(x, numbers))
+
+
+@dataclass(frozen=True, eq=False)
+class _Itself:
+    """What is only the same as itself."""
+
+    value: Any
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Itself) and other.value is self.value
+
+    def __hash__(self) -> int:
+        return id(self.value)
 
 
 def mjcf_system(

@@ -33,9 +33,10 @@ def rig(tmp_path_factory):
 def member(bench, k):
     x = bench.starts(Candidate((k,)), jnp.array([0.0]))[1]
     delta = jnp.zeros((bench.shots.y.shape[0], 2))
-    used = bench.used(Candidate((k,)))
-    given = (x[:used], delta, jnp.array([0.01, 0.1]), jnp.zeros(used, bool))
-    fit = solve(bench.simulator(Candidate((k,))), bench.setup(Candidate((k,))), *given).widen(bench.size)
+    given = (x, delta, jnp.array([0.01, 0.1]), jnp.zeros(x.size, bool))
+    fit = solve(
+        bench.simulator(Candidate((k,))), bench.setup(Candidate((k,))), *given, live=bench.used(Candidate((k,)))
+    )
     fit = fit.replace(precision=1e4 * jnp.eye(x.size))
     return Entry(Candidate((k,)), bench.names(Candidate((k,))), fit, np.zeros(1), None)
 

@@ -7,12 +7,14 @@ import pytest
 
 from bayessim_jax.diagnosis.forcing import Joint, commands_of, force_of, restore_readings
 from bayessim_jax.diagnosis.response import (
+    Beside,
     Forcing,
     Motion,
+    Ways,
     Windowed,
     assess,
+    differ,
     find_gaps,
-    linearize_steps,
     respond,
     separate,
 )
@@ -55,7 +57,7 @@ def test_the_response_to_a_force_is_the_simulators_to_first_order(arm):
     start = jnp.array([0.6, -0.4]), jnp.array([1.0, -2.0])
     plain = simulate(arm, *start, ctrl, jnp.zeros((STEPS, 2)))
     motion = Motion(plain[None, :, :2], plain[None, :, 2:], ctrl[None], jnp.zeros((1, 0, 1)), jnp.zeros(1))
-    lin = linearize_steps(arm.engine, lambda x: x, motion, jnp.zeros(0), jnp.zeros((1, 0)), 2, 0.0)
+    lin = linearize(arm, motion, [])
     np.testing.assert_allclose(lin.gap, 0.0, atol=1e-10)
     errors = []
     for size in (1e-2, 1e-3):
@@ -77,30 +79,67 @@ def test_the_response_to_a_force_is_the_simulators_to_first_order(arm):
     assert errors[1] < 0.2 * errors[0]
 
 
-def test_slopes_of_the_response_are_those_of_finite_differences(arm):
+def linearize(arm, motion, theta, length=1e-6, central=False):
+    """Steps linearized along forces, the state and θ, with room for one parameter of a candidate."""
+    theta, sides = jnp.asarray(theta, float), (1.0, -1.0) if central else (1.0,)
+    count, d = 6 + theta.size, theta.size
+    ways = jnp.concatenate([s * length * jnp.eye(count) for s in sides]).reshape(len(sides), count, count)
+    ways = jnp.concatenate([jnp.zeros((1, count)), jnp.moveaxis(ways, 0, 1).reshape(-1, count)])
+    beside = Beside(theta + ways[:, 6:], ways[:, 2:6], ways[:, :2])
+    gaps = find_gaps(arm.engine, _same, motion, beside, len(ways), 2)
+    nothing = jnp.zeros(1, int), jnp.array([9])
+    along = Ways(jnp.full(count, len(sides) * length), *nothing, jnp.arange(2), 2 + jnp.arange(4), 6 + jnp.arange(d))
+    return differ(None, gaps, along, True, central)
+
+
+def test_slopes_of_steps_are_their_derivatives():
+    arm = mjcf_system(DOUBLE, [Unknown("damping", ("joint/a/damping",), 0.0, 1.0)], substeps=2)
+    motion, (engine, nv) = random_motion(), (arm.engine, 2)
+    q, v, u = motion.qpos[0, 5], motion.qvel[0, 5], motion.ctrl[0, 5]
+
+    def step(theta, q, v, force):
+        after = engine.step(theta, engine.init(theta, q, v), u, force, 2)
+        return jnp.concatenate([engine.qpos(after), engine.qvel(after)])
+
+    point = jnp.array([0.2]), q, v, jnp.zeros(nv)
+    along, by_q, by_v, by_force = jax.jacfwd(step, argnums=(0, 1, 2, 3))(*point)
+    for central, tolerance in ((False, 1e-4), (True, 1e-7)):
+        lin = linearize(arm, motion, [0.2], central=central)
+        np.testing.assert_allclose(lin.a[0, 5], jnp.concatenate([by_q, by_v], 1), atol=tolerance)
+        np.testing.assert_allclose(lin.b[0, 5], by_force, atol=tolerance)
+        np.testing.assert_allclose(lin.along[0, 5, :, :1], along, atol=tolerance)
+        there = jnp.concatenate([motion.qpos[0, 6], motion.qvel[0, 6]])
+        np.testing.assert_allclose(lin.gap[0, 5], step(*point) - there, atol=1e-12)
+
+
+def random_motion():
     rng = np.random.default_rng(0)
     qpos, qvel = (jnp.asarray(rng.normal(0, 0.1, (1, STEPS + 1, 2)).cumsum(1)) for _ in range(2))
-    motion = Motion(qpos, qvel, jnp.zeros((1, STEPS, 1)), jnp.zeros((1, 0, 1)), jnp.zeros(1))
-    forward = linearize_steps(arm.engine, lambda x: x, motion, jnp.zeros(0), jnp.zeros((1, 0)), 2, 0.0)
-    central = linearize_steps(arm.engine, lambda x: x, motion, jnp.zeros(0), jnp.zeros((1, 0)), 2, 1e-5)
-    for one, other in ((forward.a, central.a), (forward.b, central.b), (forward.gap, central.gap)):
-        np.testing.assert_allclose(one, other, atol=1e-6)
+    return Motion(qpos, qvel, jnp.zeros((1, STEPS, 1)), jnp.zeros((1, 0, 1)), jnp.zeros(1))
 
 
 def test_where_steps_lead_is_found_without_linearizing_them():
     arm = mjcf_system(DOUBLE, [Unknown("damping", ("joint/a/damping",), 0.0, 1.0)], substeps=2)
-    rng = np.random.default_rng(0)
-    qpos, qvel = (jnp.asarray(rng.normal(0, 0.1, (1, STEPS + 1, 2)).cumsum(1)) for _ in range(2))
-    motion = Motion(qpos, qvel, jnp.zeros((1, STEPS, 1)), jnp.zeros((1, 0, 1)), jnp.zeros(1))
-    for damping in (0.0, 0.2):
-        lin = linearize_steps(arm.engine, _same, motion, jnp.array([damping]), jnp.eye(1), 2, 0.0)
-        points = jnp.array([[damping], [damping + 1e-5], [damping], [np.nan]])
-        forces = jnp.zeros((4, 2)).at[2, 1].set(1e-4)
-        gap, beside, pushed, rest = find_gaps(arm.engine, _same, motion, points, forces, 3, 2)
-        np.testing.assert_allclose(gap, lin.gap, atol=1e-12)
-        np.testing.assert_allclose((beside - gap) / 1e-5, lin.along[..., 0], rtol=1e-3, atol=1e-6)
-        np.testing.assert_allclose((pushed - gap) / 1e-4, lin.b[..., 1], rtol=1e-3, atol=1e-6)
-        assert (rest == 0.0).all()
+    motion, here, there = random_motion(), *(linearize(arm, random_motion(), [x]) for x in (0.1, 0.2))
+    points = jnp.array([[0.2], [0.2 + 1e-5], [0.2], [np.nan]])
+    forces = jnp.zeros((4, 2)).at[2, 1].set(1e-4)
+    gaps = find_gaps(arm.engine, _same, motion, Beside(points, jnp.zeros((4, 4)), forces), 3, 2)
+    assert (gaps[3] == 0.0).all()
+    ways = Ways(
+        jnp.array([1e-5, 1e-4, 1.0]),
+        jnp.array([0]),
+        jnp.array([1]),
+        jnp.array([2, 1]),
+        jnp.zeros(0, int),
+        jnp.zeros(1, int),
+    )
+    found = differ(here, gaps, ways, True, False)
+    np.testing.assert_allclose(found.gap, there.gap, atol=1e-12)
+    np.testing.assert_allclose(found.along[..., 1], there.along[..., 0], rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(found.b[..., 1], there.b[..., 1], rtol=1e-3, atol=1e-6)
+    np.testing.assert_array_equal(found.a, here.a)
+    np.testing.assert_array_equal(found.along[..., 0], here.along[..., 0])
+    np.testing.assert_array_equal(differ(here, gaps, ways, False, False).b, here.b)
 
 
 def _same(x):

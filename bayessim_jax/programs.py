@@ -1,0 +1,235 @@
+"""Programs that are traced once for all processes, not once in each.
+
+JAX's compilation cache keeps what XLA made of a program; to find it there, every process traces and lowers the program
+again, which for a robot in a loop over time steps takes seconds of Python. `trace_once` keeps what tracing led to, as
+StableHLO of `jax.export`, under a name that is made of everything the trace depends on: the package's own code, the
+versions of what it stands on, static arguments, and shapes of the others. What has no such name, a function from
+elsewhere for instance, is traced as ever. Nothing is kept until `keep_traces_in` says where; nothing in these files is
+run but by XLA, and a file that cannot be read is made again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import importlib.metadata
+import inspect
+import struct
+import sys
+import tempfile
+import types
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+from jax import export
+
+__all__ = ["Unnamed", "keep_traces_in", "name_of", "trace_once"]
+
+PACKAGE = __package__ or "bayessim_jax"
+STANDS_ON = ("jax", "jaxlib", "flax", "mujoco", "numpy")
+
+_folder: Path | None = None
+
+
+class Unnamed(Exception):  # noqa: N818
+    """A value that another process would not recognize."""
+
+
+def keep_traces_in(folder: Path | None) -> None:
+    """Where programs are kept from now on; None for nowhere."""
+    global _folder
+    _folder = folder
+
+
+def trace_once(
+    function: Callable[..., Any] | None = None,
+    *,
+    static_argnames: str | Sequence[str] = (),
+    compiler_options: Mapping[str, Any] | None = None,
+) -> Any:
+    """`jax.jit` of a function whose trace is kept where `keep_traces_in` says. It returns arrays in tuples or lists."""
+    if function is None:
+        return functools.partial(trace_once, static_argnames=static_argnames, compiler_options=compiler_options)
+    statics = {static_argnames} if isinstance(static_argnames, str) else set(static_argnames)
+    options: Any = dict(compiler_options) if compiler_options else None
+    traced = jax.jit(function, static_argnames=tuple(statics), compiler_options=options)
+    names = list(inspect.signature(function).parameters)
+    made: dict[Any, Any] = {}
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        if _folder is None:
+            return traced(*args, **kwargs)
+        given = dict(zip(names, args, strict=False)) | kwargs
+        fixed = {name: given.pop(name) for name in names if name in statics and name in given}
+        leaves, structure = jax.tree.flatten(given)
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+            return traced(*args, **kwargs)
+        kinds = tuple((np.shape(leaf), jax.dtypes.result_type(leaf)) for leaf in leaves)
+        key = _folder, tuple(fixed.values()), structure, kinds
+        program = made.get(key)
+        if program is None:
+            program = made[key] = _find(_folder, function, fixed, leaves, structure, kinds, options) or traced
+        return program(*args, **kwargs) if program is traced else program(*leaves)
+
+    call.clear_cache = traced.clear_cache  # type: ignore[attr-defined]
+    return call
+
+
+def _find(
+    folder: Path,
+    function: Callable[..., Any],
+    fixed: dict[str, Any],
+    leaves: Sequence[Any],
+    structure: Any,
+    kinds: Any,
+    options: Any,
+) -> Callable[..., Any] | None:
+    """The program from the disk, or traced and put there; None where it has no name or cannot be kept."""
+    config = jax.default_backend(), bool(jax.config.jax_enable_x64), jax.config.jax_default_matmul_precision
+    try:
+        path = folder / name_of((_standing(), config, function, fixed, structure, kinds))
+    except Unnamed:
+        return None
+    exported = _read(path)
+    if exported is None:
+
+        def flat(*leaves: Any) -> Any:
+            return function(**jax.tree.unflatten(structure, leaves), **fixed)
+
+        try:
+            exported = export.export(jax.jit(flat))(*leaves)
+            content = bytes(exported.serialize())
+        except (NotImplementedError, ValueError):
+            return None  # a call into Python, which no file can hold
+        _write(path, content)
+
+    def run(*leaves: Any) -> Any:
+        return exported.call(*leaves)
+
+    run.__name__ = function.__name__
+    program = jax.jit(run, compiler_options=options)
+    # what such a program returns is tied to its device, and other programs would be compiled once more for it
+    return program if config[0] != "cpu" else lambda *leaves: jax.tree.map(_untie, program(*leaves))
+
+
+def _untie(x: Any) -> Any:
+    """The same numbers, at no device in particular; on a CPU they stay where they are."""
+    return jax.device_put(np.asarray(x))
+
+
+def _read(path: Path) -> Any:
+    """What a file holds; None where there is none, or none that can be read."""
+    try:
+        content = path.read_bytes()
+        return export.deserialize(bytearray(content))
+    except Exception:
+        return None
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Put a file there whole or not at all."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+            file.write(content)
+        Path(file.name).replace(path)
+    except OSError:
+        return
+
+
+@functools.cache
+def _standing() -> bytes:
+    """The package's code, and the versions of what it stands on."""
+    found = hashlib.sha256(sys.version.encode())
+    for name in STANDS_ON:
+        found.update(importlib.metadata.version(name).encode())
+    root = Path(__file__).parent
+    for path in sorted(root.rglob("*.py")):
+        found.update(str(path.relative_to(root)).encode() + path.read_bytes())
+    return found.digest()
+
+
+def name_of(value: Any) -> str:
+    """A name that is the same in every process for equal values, and another one for others; else `Unnamed`."""
+    found = hashlib.sha256()
+    _feed(found.update, value)
+    return found.hexdigest()
+
+
+def _feed(put: Callable[[bytes], None], x: Any) -> None:
+    """Everything that a value is made of, each piece with its kind and length."""
+    kind = f"{type(x).__module__}.{type(x).__qualname__}"
+
+    def piece(content: bytes) -> None:
+        put(f"{kind}:{len(content)}:".encode() + content)
+
+    if x is None or isinstance(x, (bool, int, str, bytes)):
+        piece(x if isinstance(x, bytes) else repr(x).encode())
+    elif isinstance(x, float):
+        piece(struct.pack("<d", x))
+    elif isinstance(x, (np.ndarray, np.generic, np.dtype)) or (
+        isinstance(x, jax.Array) and not isinstance(x, jax.core.Tracer)
+    ):
+        piece(_content(x))
+    elif isinstance(x, (tuple, list)):
+        piece(str(len(x)).encode())
+        for each in x:
+            _feed(put, each)
+    elif isinstance(x, Mapping):
+        _feed(put, list(x.items()))
+    elif isinstance(x, jax.tree_util.PyTreeDef):
+        piece(b"")
+        _feed(put, x.node_data())
+        _feed(put, x.children())
+    elif isinstance(x, mujoco.MjModel):
+        saved = np.empty(mujoco.mj_sizeModel(x), np.uint8)
+        mujoco.mj_saveModel(x, None, saved)
+        piece(saved.tobytes())
+    elif isinstance(x, type):
+        piece(_place(x))
+    elif isinstance(x, types.FunctionType):
+        if x.__closure__:
+            raise Unnamed(repr(x))
+        piece(_place(x))
+    else:
+        _feed_object(put, x)
+
+
+def _feed_object(put: Callable[[bytes], None], x: Any) -> None:
+    """An object of the package: what it says makes it equal to others (`_key`), or all that it holds."""
+    put(_place(type(x)))
+    if hasattr(x, "_key"):
+        _feed(put, x._key)
+    elif dataclasses.is_dataclass(x):
+        _feed(put, [(f.name, getattr(x, f.name)) for f in dataclasses.fields(x)])
+    elif hasattr(x, "__dict__"):
+        _feed(put, sorted(vars(x).items()))
+    else:
+        raise Unnamed(repr(x))
+
+
+def _content(x: Any) -> bytes:
+    """Numbers, with their type and shape; of an object type none."""
+    if isinstance(x, np.dtype):
+        return x.str.encode()
+    if isinstance(x, jax.Array) and not jax.numpy.issubdtype(x.dtype, np.number) and x.dtype != bool:
+        raise Unnamed(repr(x))
+    array = np.asarray(x)
+    if array.dtype.hasobject:
+        raise Unnamed(repr(x))
+    return f"{array.dtype.str}{array.shape}".encode() + array.tobytes()
+
+
+def _place(x: Any) -> bytes:
+    """Where a class or function of the package, of Python or of NumPy stands."""
+    module = x.__module__ or ""
+    root = module.partition(".")[0]
+    if root not in (PACKAGE, "builtins", "numpy") or "<" in x.__qualname__:
+        raise Unnamed(repr(x))
+    return f"{module}.{x.__qualname__};".encode()
