@@ -5,10 +5,12 @@ from __future__ import annotations
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jaxtyping import Array, Float
 
 from bayessim_jax.effects import EffectParameter, ForceEffect, Moment, Scales
 from bayessim_jax.effects.contract import Memory, Number, Values
 from bayessim_jax.effects.places import joints
+from bayessim_jax.trigonometry import sincos
 
 __all__ = ["FEATURES", "FLEXIBLE", "UNITS", "FlexibleForce", "features"]
 
@@ -21,15 +23,17 @@ FREQUENCIES = _DRAWS.normal(size=(RANDOM, 3)) * np.array([1.6, 1.6, 1.0])
 PHASES = _DRAWS.uniform(0, 2 * np.pi, size=RANDOM)
 
 
-def features(position: Number, velocity: Number, drive: Number, units: Values) -> list[Number]:
+def features(position: Number, velocity: Number, drive: Number, units: Values) -> Float[Array, "... features"]:
     """Random Fourier features of a joint's scaled state and drive, and steps and slopes in its velocity.
 
     Source: Rahimi and Recht 2007
     """
     q = (position - units["centre"]) / units["position"]
     v, u = velocity / units["speed"], drive / units["force"]
-    waves = [jnp.cos(w[0] * q + w[1] * v + w[2] * u + b) for w, b in zip(FREQUENCIES, PHASES, strict=True)]
-    return [*waves, jnp.tanh(v / 0.05), jnp.tanh(v / 0.3), v, v * abs(v), q, u]
+    state = jnp.stack([q, v, u], -1)
+    steps = jnp.stack([jnp.tanh(v / 0.05), jnp.tanh(v / 0.3), v, v * abs(v), q, u], -1)
+    angles = (state[..., None, :] * FREQUENCIES).sum(-1) + PHASES
+    return jnp.concatenate([sincos(angles)[1], steps], -1)
 
 
 class FlexibleForce(ForceEffect):
@@ -53,7 +57,7 @@ class FlexibleForce(ForceEffect):
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
         """The weighted sum."""
         phi = features(moment.position, moment.velocity, moment.drive, values)
-        return values["force"] * sum(values[f"w{k}"] * x for k, x in enumerate(phi)), memory
+        return values["force"] * (jnp.stack([values[f"w{k}"] for k in range(FEATURES)]) @ phi), memory
 
 
 FLEXIBLE = FlexibleForce()

@@ -74,8 +74,7 @@ def force_of(
         beside = None if other is None else other.moment(time, h)
         return joint.moment(time, h)._replace(detail=detail, other=beside)
 
-    def instant(x: Array, *now: Any) -> Array:
-        values = _values(kinds, x, low, high)
+    def instant(values: dict[str, Array], *now: Any) -> Array:
         return effect.force(values, effect.begin(values, moment(*now)), moment(*now))[0]
 
     def force(x: Array) -> Array:
@@ -99,8 +98,11 @@ def force_of(
 
     if x.size <= MANY:
         return _with_slopes(force, x)
+    values, rates = jax.jvp(lambda x: _values(kinds, x, low, high), (x,), (jnp.ones_like(x),))
     each = jax.vmap(jax.vmap(jax.value_and_grad(instant), (None, 0, 0, 0)), (None, 0, 0, 0))
-    return jax.tree.map(lambda f: f.reshape(len(time), -1, steps, *f.shape[2:]).mean(2), each(x, time, joint, other))
+    mean = lambda f: f.reshape(len(time), -1, steps, *f.shape[2:]).mean(2)  # noqa: E731
+    f, along = each(values, time, joint, other)
+    return mean(f), jnp.stack([rates[name] * mean(along[name]) for name, _ in kinds], -1)
 
 
 @trace_once(static_argnames=("effect", "kinds", "h", "steps", "before", "coarse"), compiler_options=COMPILER_OPTIONS)

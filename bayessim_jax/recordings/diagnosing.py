@@ -380,8 +380,8 @@ def _fit_residual_force(key: Array, taken: _Taken, none: Entry) -> _Residual | N
         position, velocity = (np.asarray(x)[rows] for x in (motion.qpos[:, :-1, q], motion.qvel[:, :-1, v]))
         drive = (np.asarray(motion.ctrl) @ gears[:, v])[rows] if motion.ctrl.shape[-1] else np.zeros(rows.sum())
         units = {name: getattr(scales[place], name) for name in UNITS}
-        phi = np.stack(_features(position, velocity, drive, units))
-        forces[place] = (scales[place].force * (weights[k] @ phi), position, velocity, drive, time)
+        phi = np.asarray(_features(position, velocity, drive, units))
+        forces[place] = (scales[place].force * (phi @ weights[k]), position, velocity, drive, time)
     return _Residual(found, bench, places, shares_from_left(left), forces)
 
 
