@@ -27,11 +27,20 @@ import jax
 import mujoco
 import numpy as np
 from jax import export
+from jax.core import Tracer
 
 __all__ = ["Unnamed", "keep_traces_in", "name_of", "trace_once"]
 
 PACKAGE = __package__ or "bayessim_jax"
 STANDS_ON = ("jax", "jaxlib", "flax", "mujoco", "numpy")
+SETTINGS = (
+    "enable_x64",
+    "default_matmul_precision",
+    "default_prng_impl",
+    "numpy_dtype_promotion",
+    "threefry_partitionable",
+)
+"""Of JAX's settings, those that a trace depends on."""
 
 _folder: Path | None = None
 
@@ -68,9 +77,9 @@ def trace_once(
         given = dict(zip(names, args, strict=False)) | kwargs
         fixed = {name: given.pop(name) for name in names if name in statics and name in given}
         leaves, structure = jax.tree.flatten(given)
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        if any(isinstance(leaf, Tracer) for leaf in leaves):
             return traced(*args, **kwargs)
-        kinds = tuple((np.shape(leaf), jax.dtypes.result_type(leaf)) for leaf in leaves)
+        kinds = tuple((np.shape(x), jax.dtypes.result_type(x), _is_weak(x)) for x in leaves)
         key = _folder, tuple(fixed.values()), structure, kinds
         program = made.get(key)
         if program is None:
@@ -91,9 +100,9 @@ def _find(
     options: Any,
 ) -> Callable[..., Any] | None:
     """The program from the disk, or traced and put there; None where it has no name or cannot be kept."""
-    config = jax.default_backend(), bool(jax.config.jax_enable_x64), jax.config.jax_default_matmul_precision
+    backend, settings = jax.default_backend(), [getattr(jax.config, f"jax_{name}") for name in SETTINGS]
     try:
-        path = folder / name_of((_standing(), config, function, fixed, structure, kinds))
+        path = folder / name_of((_standing(), backend, settings, function, fixed, structure, kinds))
     except Unnamed:
         return None
     exported = _read(path)
@@ -115,12 +124,17 @@ def _find(
     run.__name__ = function.__name__
     program = jax.jit(run, compiler_options=options)
     # what such a program returns is tied to its device, and other programs would be compiled once more for it
-    return program if config[0] != "cpu" else lambda *leaves: jax.tree.map(_untie, program(*leaves))
+    return program if backend != "cpu" else lambda *leaves: jax.tree.map(_untie, program(*leaves))
 
 
 def _untie(x: Any) -> Any:
     """The same numbers, at no device in particular; on a CPU they stay where they are."""
     return jax.device_put(np.asarray(x))
+
+
+def _is_weak(x: Any) -> bool:
+    """Whether a number takes the precision of those that it meets."""
+    return bool(getattr(x, "weak_type", isinstance(x, (bool, int, float, complex)) and not isinstance(x, np.generic)))
 
 
 def _read(path: Path) -> Any:
@@ -173,9 +187,7 @@ def _feed(put: Callable[[bytes], None], x: Any) -> None:
         piece(x if isinstance(x, bytes) else repr(x).encode())
     elif isinstance(x, float):
         piece(struct.pack("<d", x))
-    elif isinstance(x, (np.ndarray, np.generic, np.dtype)) or (
-        isinstance(x, jax.Array) and not isinstance(x, jax.core.Tracer)
-    ):
+    elif isinstance(x, (np.ndarray, np.generic, np.dtype)) or (isinstance(x, jax.Array) and not isinstance(x, Tracer)):
         piece(_content(x))
     elif isinstance(x, (tuple, list)):
         piece(str(len(x)).encode())
@@ -184,9 +196,10 @@ def _feed(put: Callable[[bytes], None], x: Any) -> None:
     elif isinstance(x, Mapping):
         _feed(put, list(x.items()))
     elif isinstance(x, jax.tree_util.PyTreeDef):
+        definition: Any = x
         piece(b"")
-        _feed(put, x.node_data())
-        _feed(put, x.children())
+        _feed(put, definition.node_data())
+        _feed(put, definition.children())
     elif isinstance(x, mujoco.MjModel):
         saved = np.empty(mujoco.mj_sizeModel(x), np.uint8)
         mujoco.mj_saveModel(x, None, saved)

@@ -246,7 +246,8 @@ class Scene(CandidatesOf):
         after = m + np.arange(3 * nv + d)
         used = m + nv * forced + (2 * nv + d) * whole
         beside = Beside(*(_device(x) for x in (points, move, force)))
-        ways = Ways(_device(len(sides) * width), own, places, after[:nv], after[nv : 3 * nv], after[3 * nv :])
+        which = map(jax.device_put, (own, places, after[:nv], after[nv : 3 * nv], after[3 * nv :]))
+        ways = Ways(_device(len(sides) * width), *which)
         return 1 + len(sides) * used, beside, ways
 
     def _find_around(self, candidate: Candidate, p: Float[np.ndarray, " k"], motion: Motion) -> _Around:
