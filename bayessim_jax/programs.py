@@ -86,7 +86,6 @@ def trace_once(
             program = made[key] = _find(_folder, function, fixed, leaves, structure, kinds, options) or traced
         return program(*args, **kwargs) if program is traced else program(*leaves)
 
-    call.clear_cache = traced.clear_cache  # type: ignore[attr-defined]
     return call
 
 
@@ -150,11 +149,11 @@ def _write(path: Path, content: bytes) -> None:
     """Put a file there whole or not at all."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-            file.write(content)
-        Path(file.name).replace(path)
+        with tempfile.TemporaryDirectory(dir=path.parent) as beside:
+            (Path(beside) / path.name).write_bytes(content)
+            (Path(beside) / path.name).replace(path)
     except OSError:
-        return
+        return  # a full or a foreign disk costs time, and no result
 
 
 @functools.cache

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bayessim_jax.recordings.assemble import read_recording
@@ -16,7 +17,6 @@ from bayessim_jax.recordings.wording import CaseError, Finding, hint, merge, quo
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from pathlib import Path
 
     from bayessim_jax.recordings.recording import CaseRecording
 
@@ -69,14 +69,14 @@ class LoadedCase:
         return spec, write_values(spec, places)  # type: ignore[arg-type]
 
 
-def load_case(folder: Path, *, mask: bool = False) -> LoadedCase:
+def load_case(folder: str | Path, *, mask: bool = False) -> LoadedCase:
     """Read a case folder and check all of it.
 
     Numbers that are missing, and gaps longer than a window, are errors, unless to `mask` them is asked for.
     Raises `CaseError` where `case.toml` or the model cannot be read, because nothing more can be said then; what is
     wrong with parameters and recordings is among the findings.
     """
-    case = read_case(folder)
+    case = read_case(Path(folder))
     spec = model = None
     names: tuple[str, ...] = ()
     if case.model:

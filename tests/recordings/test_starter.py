@@ -47,7 +47,7 @@ def test_a_new_case_needs_recordings_only(tmp_path, capsys):
     assert capsys.readouterr().err.count("no file matches recordings") == 1
     (tmp_path / "case" / "recordings" / "run1.csv").write_text(csv_text(columns()))
     assert main(["check", str(tmp_path / "case")]) == 0
-    case = load_case(tmp_path / "case").check()
+    case = load_case(str(tmp_path / "case")).check()
     assert {p.name: p.nominal for p in case.parameters} == {"bob_mass": pytest.approx(0.3), "hinge_damping": 0.05}
     for parameter in case.parameters:
         assert parameter.prior.low <= parameter.nominal <= parameter.prior.high
