@@ -21,7 +21,7 @@ from bayessim_jax.programs import trace_once
 __all__ = ["Joint", "Kinds", "force_of", "restore_readings", "commands_of"]
 
 MANY = 12
-"""Parameters from which on reverse-mode derivatives of every moment's force cost less than forward-mode ones."""
+"""Parameters beyond which reverse-mode derivatives of every moment's force cost less than forward-mode ones."""
 Kinds = tuple[tuple[str, str], ...]
 """Name and kind of margin of every parameter of an effect."""
 
@@ -64,8 +64,6 @@ def force_of(
 ) -> tuple[Float[Array, "windows rows"], Float[Array, "windows rows k"]]:
     """Mean force of a `ForceEffect` in every row of so many time steps, and its derivatives along x.
 
-    An effect of many parameters remembers nothing.
-
     `earlier` are positions, velocities and what actuators exerted before the windows, every `period` s, for one that
     remembers them.
     """
@@ -96,7 +94,9 @@ def force_of(
 
         return jax.vmap(window)(time, joint, other, earlier)
 
-    if x.size <= MANY:
+    now = jax.tree.map(lambda a: a[0, 0], (time, joint, other))
+    remembers = jax.tree.leaves(effect.begin(_values(kinds, x, low, high), moment(*now)))
+    if x.size <= MANY or remembers:
         return _with_slopes(force, x)
     values, rates = jax.jvp(lambda x: _values(kinds, x, low, high), (x,), (jnp.ones_like(x),))
     each = jax.vmap(jax.vmap(jax.value_and_grad(instant), (None, 0, 0, 0)), (None, 0, 0, 0))

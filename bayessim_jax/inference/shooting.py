@@ -346,7 +346,7 @@ def solve(
     A step that does not lower the cost, or leads to a number that is not finite, is refused and shortened; where the
     cost falls by less than a quarter of what the slopes promise, the next one is shorter, too. `damping` is where that
     begins. The solver has converged when two accepted steps in a row lower the cost by less than 1e-7 of it (1e-4 where
-    derivatives are differences, as where bodies collide), or when no step does.
+    `step` is told, as where bodies collide), or when no step does.
 
     Only the simulation and its derivatives are compiled for a `predict`; the algebra is compiled once for all of the
     same size.

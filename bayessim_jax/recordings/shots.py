@@ -86,7 +86,7 @@ class CaseModel:
 
     @property
     def step(self) -> float:
-        """Length of the differences that stand for derivatives; 0 where the engine is differentiable."""
+        """Length of the differences that stand for derivatives where bodies collide; 0 where the engine is smooth."""
         return 1e-3 if self.engine_name == "mujoco" else 0.0
 
     @property

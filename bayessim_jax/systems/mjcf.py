@@ -128,11 +128,13 @@ def system_key(system: Any) -> Hashable:
     return structure, tuple(known), tuple(_Itself(x) for x in leaves if not isinstance(x, numbers))
 
 
-@dataclass(frozen=True, eq=False)
 class _Itself:
-    """What is only the same as itself."""
+    """What is only the same as itself, and in another process nothing (`programs.name_of`)."""
 
-    value: Any
+    __slots__ = ("value",)
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Itself) and other.value is self.value
