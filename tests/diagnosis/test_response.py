@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from bayessim_jax.diagnosis.flexible import FLEXIBLE, FlexibleForce
 from bayessim_jax.diagnosis.forcing import Joint, commands_of, force_of, restore_readings
 from bayessim_jax.diagnosis.response import (
     Beside,
@@ -18,7 +19,7 @@ from bayessim_jax.diagnosis.response import (
     respond,
     separate,
 )
-from bayessim_jax.effects import EFFECTS, Moment
+from bayessim_jax.effects import EFFECTS, Moment, Scales
 from bayessim_jax.systems.mjcf import Unknown, displace, mjcf_system
 
 DOUBLE = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
@@ -159,6 +160,32 @@ def along(velocity):
     n = velocity.shape[1]
     still = jnp.zeros_like(velocity)
     return 0.002 * jnp.arange(n)[None], Joint(still, velocity, still, still + 0.1, still + 0.5)
+
+
+class Lingering(FlexibleForce):
+    """The same force, half of it a time step late."""
+
+    def begin(self, values, moment):
+        return jnp.zeros(())
+
+    def force(self, values, memory, moment):
+        now = super().force(values, (), moment)[0]
+        return 0.5 * (now + memory), now
+
+
+@pytest.mark.parametrize("effect", [FLEXIBLE, Lingering()])
+def test_slopes_along_many_parameters_are_those_of_differences(effect):
+    time, joint = along(jnp.linspace(-3.0, 3.0, 40)[None])
+    parameters = effect.parameters("joint/a", Scales())
+    kinds = tuple((p.name, "uniform") for p in parameters)
+    low, high = (jnp.array([getattr(p, side) for p in parameters]) for side in ("low", "high"))
+    x = 0.3 * jax.random.normal(jax.random.key(0), (len(parameters),))
+    at = lambda x: force_of(effect, kinds, "", 0.002, 2, x, low, high, time, joint, None)  # noqa: E731
+    force, slopes = at(x)
+    assert force.shape == (1, 20) and slopes.shape == (1, 20, len(parameters))
+    for k in (0, 7, 20, len(parameters) - 1):
+        ahead, behind = (at(x.at[k].add(s))[0] for s in (1e-5, -1e-5))
+        np.testing.assert_allclose(slopes[..., k], (ahead - behind) / 2e-5, atol=1e-7)
 
 
 def test_friction_along_a_motion_opposes_it_and_grows_with_its_level():
