@@ -60,33 +60,53 @@ def trace_once(
     *,
     static_argnames: str | Sequence[str] = (),
     compiler_options: Mapping[str, Any] | None = None,
+    to_numpy: bool = False,
 ) -> Any:
-    """`jax.jit` of a function whose trace is kept where `keep_traces_in` says. It returns arrays in tuples or lists."""
+    """`jax.jit` of a function whose trace is kept where `keep_traces_in` says. It returns arrays in tuples or lists.
+
+    With `to_numpy` it returns NumPy's: for what is put together on the host, at a tenth of the cost of a call.
+    """
     if function is None:
-        return functools.partial(trace_once, static_argnames=static_argnames, compiler_options=compiler_options)
+        return functools.partial(
+            trace_once, static_argnames=static_argnames, compiler_options=compiler_options, to_numpy=to_numpy
+        )
     statics = {static_argnames} if isinstance(static_argnames, str) else set(static_argnames)
     options: Any = dict(compiler_options) if compiler_options else None
     traced = jax.jit(function, static_argnames=tuple(statics), compiler_options=options)
     names = list(inspect.signature(function).parameters)
     made: dict[Any, Any] = {}
 
+    def give(returned: Any, tied: bool) -> Any:
+        if to_numpy:
+            return jax.tree.map(np.asarray, returned)
+        return jax.tree.map(_untie, returned) if tied and jax.default_backend() == "cpu" else returned
+
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         if _folder is None:
-            return traced(*args, **kwargs)
+            return give(traced(*args, **kwargs), tied=False)
         given = dict(zip(names, args, strict=False)) | kwargs
         fixed = {name: given.pop(name) for name in names if name in statics and name in given}
         leaves, structure = jax.tree.flatten(given)
         if any(isinstance(leaf, Tracer) for leaf in leaves):
             return traced(*args, **kwargs)
-        kinds = tuple((np.shape(x), jax.dtypes.result_type(x), _is_weak(x)) for x in leaves)
-        key = _folder, tuple(fixed.values()), structure, kinds
+        key = _folder, tuple(fixed.values()), structure, tuple(map(_kind, leaves))
         program = made.get(key)
         if program is None:
-            program = made[key] = _find(_folder, function, fixed, leaves, structure, kinds, options) or traced
-        return program(*args, **kwargs) if program is traced else program(*leaves)
+            program = made[key] = _find(_folder, function, fixed, leaves, structure, options) or traced
+        known = program is not traced
+        return give(program(*leaves) if known else program(*args, **kwargs), tied=known)
 
     return call
+
+
+def _kind(x: Any) -> tuple[Any, ...]:
+    """What of an argument decides which program it belongs to."""
+    if isinstance(x, np.ndarray):
+        return x.shape, x.dtype
+    if isinstance(x, jax.Array):
+        return x.shape, x.dtype, x.weak_type
+    return np.shape(x), jax.dtypes.result_type(x), _is_weak(x)
 
 
 def _find(
@@ -95,10 +115,10 @@ def _find(
     fixed: dict[str, Any],
     leaves: Sequence[Any],
     structure: Any,
-    kinds: Any,
     options: Any,
 ) -> Callable[..., Any] | None:
     """The program from the disk, or traced and put there; None where it has no name or cannot be kept."""
+    kinds = tuple((np.shape(x), jax.dtypes.result_type(x), _is_weak(x)) for x in leaves)
     backend, settings = jax.default_backend(), [getattr(jax.config, f"jax_{name}") for name in SETTINGS]
     try:
         path = folder / name_of((_standing(), backend, settings, function, fixed, structure, kinds))
@@ -121,13 +141,14 @@ def _find(
         return exported.call(*leaves)
 
     run.__name__ = function.__name__
-    program = jax.jit(run, compiler_options=options)
-    # what such a program returns is tied to its device, and other programs would be compiled once more for it
-    return program if backend != "cpu" else lambda *leaves: jax.tree.map(_untie, program(*leaves))
+    return jax.jit(run, compiler_options=options)
 
 
 def _untie(x: Any) -> Any:
-    """The same numbers, at no device in particular; on a CPU they stay where they are."""
+    """The same numbers, at no device in particular; on a CPU they stay where they are.
+
+    What a program from the disk returns is tied to its device, and other programs would be compiled once more for it.
+    """
     return jax.device_put(np.asarray(x))
 
 

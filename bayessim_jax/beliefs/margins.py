@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import jax
@@ -16,8 +15,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from bayessim_jax.contracts import Scalar
 
-__all__ = ["Margin", "Margins", "log_normal", "log_uniform", "normal", "uniform"]
+__all__ = ["Margin", "Margins", "log_normal", "log_uniform", "normal", "uniform", "values_between"]
 
+Numbers = Array | np.ndarray
 EDGE = 1e-12
 """Probabilities nearer than this to 0 and 1 have no finite z."""
 STEP = 1e-5
@@ -37,21 +37,11 @@ class Margin:
     low: float = struct.field(pytree_node=False, default=-float("inf"))
     high: float = struct.field(pytree_node=False, default=float("inf"))
 
-    def between(self, a: Any, b: Any) -> Margin:
-        """The same kind with other numbers, which may be traced."""
-        return replace(self, a=a, b=b)
-
     def value(self, z: Any) -> Any:
         """θ at a standard normal z: a JAX array, or a number or array of NumPy's, with which nothing is compiled."""
-        xp, special = _library(z, self.a, self.b)
-        if self.kind == "uniform":
-            return self.a + (self.b - self.a) * special.ndtr(z)
-        if self.kind == "log_uniform":
-            return self.a * xp.exp(xp.log(self.b / self.a) * special.ndtr(z))
-        if self.kind == "log_normal":
-            return xp.exp(self.a + self.b * z)
-        if not self._cut:
-            return self.a + self.b * z
+        if not self.is_cut:
+            return _uncut(self.kind, self.a, self.b, z)
+        xp, special = _library(z)
         first, last = self._shares
         return self.a + self.b * special.ndtri(xp.clip(first + (last - first) * special.ndtr(z), EDGE, 1 - EDGE))
 
@@ -69,7 +59,7 @@ class Margin:
             share = xp.log(xp.maximum(value, 1e-300) / self.a) / xp.log(self.b / self.a)
         elif self.kind == "log_normal":
             return (xp.log(xp.maximum(value, 1e-300)) - self.a) / self.b
-        elif not self._cut:
+        elif not self.is_cut:
             return (value - self.a) / self.b
         else:
             first, last = self._shares
@@ -78,7 +68,8 @@ class Margin:
         return special.ndtri(xp.clip(share, edge, 1 - edge))
 
     @property
-    def _cut(self) -> bool:
+    def is_cut(self) -> bool:
+        """Whether it is a normal distribution on an interval."""
         return self.low > -float("inf") or self.high < float("inf")
 
     @property
@@ -91,6 +82,31 @@ def _library(*numbers: Any) -> tuple[Any, Any]:
     """NumPy and SciPy's functions for their numbers, JAX's for those of JAX."""
     jaxed = any(isinstance(x, jax.Array) for x in numbers)
     return (jnp, jax_special) if jaxed else (np, numpy_special)
+
+
+def _uncut(kind: str, a: Any, b: Any, z: Any) -> Any:
+    """θ at z of a margin of this kind, or of several."""
+    xp, special = _library(z, a, b)
+    if kind == "uniform":
+        return a + (b - a) * special.ndtr(z)
+    if kind == "log_uniform":
+        return a * xp.exp(xp.log(b / a) * special.ndtr(z))
+    return xp.exp(a + b * z) if kind == "log_normal" else a + b * z
+
+
+def values_between(
+    kinds: Sequence[str], a: Float[Numbers, " d"], b: Float[Numbers, " d"], z: Float[Numbers, " d"]
+) -> Any:
+    """Values at z of margins that are not cut and whose numbers may be traced, all of a kind at once.
+
+    One by one they would be as many copies of the normal distribution's polynomials in a program.
+    """
+    distinct = list(dict.fromkeys(kinds))
+    if len(distinct) < 2:
+        return _uncut(distinct[0], a, b, z) if kinds else z
+    rows = [np.flatnonzero([other == kind for other in kinds]) for kind in distinct]
+    every = [_uncut(kind, a[own], b[own], z[own]) for kind, own in zip(distinct, rows, strict=True)]
+    return _library(z, a, b)[0].concatenate(every)[np.argsort(np.concatenate(rows))]
 
 
 def uniform(low: float, high: float) -> Margin:
@@ -137,9 +153,12 @@ class Margins:
     def __add__(self, other: Margins) -> Margins:
         return Margins(self.names + other.names, self.each + other.each, self.units + other.units)
 
-    def theta(self, z: Float[Array, " d"]) -> Float[Array, " d"]:
-        """Parameters in raw units."""
-        return jnp.stack([m.value(z[k]) for k, m in enumerate(self.each)]) if self.each else z
+    def theta(self, z: Float[Numbers, " d"]) -> Any:
+        """Parameters in raw units, of JAX or NumPy."""
+        if any(m.is_cut for m in self.each):
+            return _library(z)[0].stack([m.value(z[k]) for k, m in enumerate(self.each)])
+        a, b = (np.array([getattr(m, side) for m in self.each], z.dtype) for side in "ab")
+        return values_between([m.kind for m in self.each], a, b, z)
 
     def standard(self, theta: Float[Array, " d"]) -> Float[Array, " d"]:
         """The z of given parameters."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from bayessim_jax.beliefs.triangular import factor
 from bayessim_jax.contracts import Scalar
 
-with warnings.catch_warnings():
-    warnings.filterwarnings("ignore", category=DeprecationWarning)
+if TYPE_CHECKING:
     import distrax
 
 __all__ = ["GaussianMixture", "moment_match"]
@@ -38,6 +38,11 @@ class GaussianMixture:
 
     def distribution(self) -> distrax.MixtureSameFamily:
         """The same law as a distrax distribution."""
+        # imported late: a diagnosis takes none, and it takes half a second
+        with warnings.catch_warnings(), jax.ensure_compile_time_eval():
+            warnings.filterwarnings("ignore", category=DeprecationWarning)
+            import distrax
+
         return distrax.MixtureSameFamily(
             distrax.Categorical(logits=self.log_weights),
             distrax.MultivariateNormalTri(self.means, self.scale_trils),

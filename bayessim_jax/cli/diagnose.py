@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
@@ -14,6 +16,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 __all__ = ["Diagnose", "diagnose"]
+
+LATER = ("bayessim_jax.recordings.results", "bayessim_jax.report.diagnose")
+"""What writes files and draws: it is imported beside the work, for that takes more than a second."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +52,13 @@ def diagnose(words: Sequence[str]) -> int:
 
         from bayessim_jax.recordings.diagnosing import diagnose_case
         from bayessim_jax.recordings.evaluation import BEFORE
+
+        Thread(target=lambda: [import_module(name) for name in LATER]).start()
+        model = run.model(engine=command.engine, before=BEFORE)
+        diagnosis = diagnose_case(jax.random.key(command.seed), model, say=run.say)
         from bayessim_jax.recordings.results import write_diagnosis
         from bayessim_jax.report.diagnose import headline, render
 
-        model = run.model(engine=command.engine, before=BEFORE)
-        diagnosis = diagnose_case(jax.random.key(command.seed), model, say=run.say)
         write_diagnosis(run.folder, diagnosis, command.seed)
         run.conclude(render(diagnosis, run.facts), [headline(diagnosis)])
     return run.code

@@ -28,7 +28,7 @@ def find_absorbed(scene: SimulatedScene, z: Float[Array, " d"], sigma: Array) ->
         own = begin_point(scene.parameters[k], scene.margin[k], NEAR)
         point = np.zeros(scene.d + scene.slots)
         point[: scene.d], point[scene.d : scene.d + len(own)] = z[: scene.d], own
-        _, _, slopes = scene.assess(candidate, point, still, sigma)
+        _, slopes = scene.expand(candidate, point, still, sigma)
         if _is_absorbed(np.asarray(slopes), scene.d, len(own), scene.slots):
             found.append(scene.name(candidate))
     return found

@@ -19,7 +19,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Scalar
 
-from bayessim_jax.beliefs.margins import Margin, Margins, log_uniform, uniform
+from bayessim_jax.beliefs.margins import Margin, Margins, log_uniform, uniform, values_between
 from bayessim_jax.effects import EffectParameter, Scales, at, with_effects
 from bayessim_jax.effects.attach import wire
 from bayessim_jax.inference.replay import Inputs, Restarted, replay_window
@@ -108,8 +108,9 @@ class Simulator:
         d = self.margins.size
         theta = self.margins.theta(x[:d])
         if self.kinds:
-            own = [m.between(tried.low[k], tried.high[k]).value(x[d + k]) for k, m in enumerate(self.kinds)]
-            theta = jnp.concatenate([theta, jnp.stack(own)])
+            kinds = [m.kind for m in self.kinds]
+            own = values_between(kinds, tried.low, tried.high, x[d : d + len(kinds)])
+            theta = jnp.concatenate([theta, own])
         return replay_window(self.augmented, theta, delta, tried.window)
 
     def __eq__(self, other: object) -> bool:

@@ -1,7 +1,8 @@
 """What an effect does along a recorded motion: the force it exerts, and how that changes with its parameters.
 
 The effects' own equations are evaluated on the smoothed motion, remembering what they remember. Nothing is simulated,
-and the programs know no model: another machine finds them in the compilation cache.
+and the programs know neither a model nor a prior: another machine finds them in the compilation cache. They take an
+effect's numbers in their own units, and `rates`, how these grow with the variable x that derivatives are along.
 """
 
 from __future__ import annotations
@@ -13,17 +14,14 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from bayessim_jax.beliefs.margins import Margin
 from bayessim_jax.effects import Moment
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS
 from bayessim_jax.programs import trace_once
 
-__all__ = ["Joint", "Kinds", "force_of", "restore_readings", "commands_of"]
+__all__ = ["Joint", "commands_of", "force_of", "restore_readings"]
 
 MANY = 12
 """Parameters beyond which reverse-mode derivatives of every moment's force cost less than forward-mode ones."""
-Kinds = tuple[tuple[str, str], ...]
-"""Name and kind of margin of every parameter of an effect."""
 
 
 @struct.dataclass
@@ -42,20 +40,23 @@ class Joint:
         return Moment(time, h, self.position, self.velocity, self.acceleration, self.inertia, self.drive)
 
 
-def _values(kinds: Kinds, x: Array, low: Array, high: Array) -> dict[str, Array]:
-    return {name: Margin(kind, 0.0, 1.0).between(low[k], high[k]).value(x[k]) for k, (name, kind) in enumerate(kinds)}
+def _named(names: tuple[str, ...], numbers: Array) -> dict[str, Array]:
+    return {name: numbers[k] for k, name in enumerate(names)}
 
 
-@trace_once(static_argnames=("effect", "kinds", "detail", "h", "steps", "period"), compiler_options=COMPILER_OPTIONS)
+@trace_once(
+    static_argnames=("effect", "names", "detail", "h", "steps", "period"),
+    compiler_options=COMPILER_OPTIONS,
+    to_numpy=True,
+)
 def force_of(
     effect: Any,
-    kinds: Kinds,
+    names: tuple[str, ...],
     detail: str,
     h: float,
     steps: int,
-    x: Float[Array, " k"],
-    low: Float[Array, " k"],
-    high: Float[Array, " k"],
+    numbers: Float[Array, " k"],
+    rates: Float[Array, " k"],
     time: Float[Array, "windows steps"],
     joint: Joint,
     other: Joint | None,
@@ -72,11 +73,12 @@ def force_of(
         beside = None if other is None else other.moment(time, h)
         return joint.moment(time, h)._replace(detail=detail, other=beside)
 
-    def instant(values: dict[str, Array], *now: Any) -> Array:
+    def instant(x: Array, *now: Any) -> Array:
+        values = _named(names, x)
         return effect.force(values, effect.begin(values, moment(*now)), moment(*now))[0]
 
     def force(x: Array) -> Array:
-        values = _values(kinds, x, low, high)
+        values = _named(names, x)
 
         def window(time: Array, joint: Joint, other: Joint | None, earlier: Any) -> Array:
             def once(memory: Any, now: Any) -> tuple[Any, Array]:
@@ -95,27 +97,29 @@ def force_of(
         return jax.vmap(window)(time, joint, other, earlier)
 
     now = jax.tree.map(lambda a: a[0, 0], (time, joint, other))
-    remembers = jax.tree.leaves(effect.begin(_values(kinds, x, low, high), moment(*now)))
-    if x.size <= MANY or remembers:
-        return _with_slopes(force, x)
-    values, rates = jax.jvp(lambda x: _values(kinds, x, low, high), (x,), (jnp.ones_like(x),))
+    remembers = jax.tree.leaves(effect.begin(_named(names, numbers), moment(*now)))
+    if numbers.size <= MANY or remembers:
+        return _with_slopes(force, numbers, rates)
     each = jax.vmap(jax.vmap(jax.value_and_grad(instant), (None, 0, 0, 0)), (None, 0, 0, 0))
     mean = lambda f: f.reshape(len(time), -1, steps, *f.shape[2:]).mean(2)  # noqa: E731
-    f, along = each(values, time, joint, other)
-    return mean(f), jnp.stack([rates[name] * mean(along[name]) for name, _ in kinds], -1)
+    f, along = each(numbers, time, joint, other)
+    return mean(f), rates * mean(along)
 
 
-@trace_once(static_argnames=("effect", "kinds", "h", "steps", "before", "coarse"), compiler_options=COMPILER_OPTIONS)
+@trace_once(
+    static_argnames=("effect", "names", "h", "steps", "before", "coarse"),
+    compiler_options=COMPILER_OPTIONS,
+    to_numpy=True,
+)
 def commands_of(
     effect: Any,
-    kinds: Kinds,
+    names: tuple[str, ...],
     h: float,
     steps: int,
     before: int,
     coarse: float,
-    x: Float[Array, " k"],
-    low: Float[Array, " k"],
-    high: Float[Array, " k"],
+    numbers: Float[Array, " k"],
+    rates: Float[Array, " k"],
     time: Float[Array, "windows steps"],
     joint: Joint,
     commands: Float[Array, "windows steps act"],
@@ -130,7 +134,7 @@ def commands_of(
     single = commands.shape[-1] == 1
 
     def change(x: Array) -> Array:
-        values = _values(kinds, x, low, high)
+        values = _named(names, x)
 
         def window(time: Array, joint: Joint, commands: Array, older: Array) -> Array:
             def moment(time: Array, joint: Joint) -> Moment:
@@ -160,18 +164,21 @@ def commands_of(
     earlier = jnp.concatenate([time[:, :1] + h * jnp.arange(-before, 0), time], 1)
     held = jax.tree.map(lambda a: jnp.concatenate([jnp.repeat(a[:, :1], before, 1), a], 1), joint)
     begun = (earlier, held)
-    return _with_slopes(change, x)
+    return _with_slopes(change, numbers, rates)
 
 
-@trace_once(static_argnames=("effect", "kinds", "period", "prompt"), compiler_options=COMPILER_OPTIONS)
+@trace_once(
+    static_argnames=("effect", "names", "period", "prompt"),
+    compiler_options=COMPILER_OPTIONS,
+    to_numpy=True,
+)
 def restore_readings(
     effect: Any,
-    kinds: Kinds,
+    names: tuple[str, ...],
     period: float,
     prompt: bool,
-    x: Float[Array, " k"],
-    low: Float[Array, " k"],
-    high: Float[Array, " k"],
+    numbers: Float[Array, " k"],
+    rates: Float[Array, " k"],
     time: Float[Array, "windows rows"],
     position: Float[Array, "windows rows"],
     velocity: Float[Array, "windows rows"],
@@ -185,14 +192,15 @@ def restore_readings(
 
     def restore(x: Array, position: Array) -> tuple[Array, Array]:
         moment = Moment(time, period, position, velocity, acceleration, jerk=jerk, prompt=prompt)
-        q, v = effect.restore(_values(kinds, x, low, high), moment)
+        q, v = effect.restore(_named(names, x), moment)
         return q * jnp.ones_like(time), v * jnp.ones_like(time)
 
-    (q, v), slope = jax.jvp(lambda position: restore(x, position), (position,), (jnp.ones_like(position),))
-    along = jax.vmap(lambda d: jax.jvp(lambda x: restore(x, position), (x,), (d,))[1], out_axes=-1)(jnp.eye(x.size))
+    (q, v), slope = jax.jvp(lambda position: restore(numbers, position), (position,), (jnp.ones_like(position),))
+    _, along = _with_slopes(lambda x: restore(x, position), numbers, rates)
     return q, v, *along, slope[0]
 
 
-def _with_slopes(f: Any, x: Array) -> tuple[Array, Array]:
-    value, along = jax.vmap(lambda d: jax.jvp(f, (x,), (d,)), out_axes=(None, 0))(jnp.eye(x.size))
-    return value, jnp.moveaxis(along, 0, -1)
+def _with_slopes(f: Any, numbers: Array, rates: Array) -> tuple[Any, Any]:
+    along = jax.vmap(lambda d: jax.jvp(f, (numbers,), (d,)), out_axes=(None, 0))
+    value, slopes = along(jnp.diag(rates))
+    return value, jax.tree.map(lambda s: jnp.moveaxis(s, 0, -1), slopes)

@@ -18,11 +18,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from bayessim_jax.contracts import Scalar
-from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Curvature, eliminate, normal_equations
+from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Curvature, eliminate
 from bayessim_jax.programs import trace_once
 from bayessim_jax.systems.mjcf import displace
 
@@ -31,15 +32,22 @@ __all__ = [
     "Forcing",
     "Linearized",
     "Motion",
+    "Readings",
+    "Rest",
     "Ways",
     "Windowed",
     "assess",
     "cross_validate",
     "differ",
+    "expand_response",
     "find_gaps",
     "propose",
     "respond",
+    "weigh",
 ]
+
+Numbers = Array | np.ndarray
+"""What is put together on the host, or comes from a program."""
 
 
 @struct.dataclass
@@ -83,17 +91,36 @@ class Windowed:
 
 
 @struct.dataclass
-class Forcing:
-    """What a candidate adds to every row's step, and to readings, at one point of its e parameters."""
+class Readings:
+    """What a candidate does to readings: they are `scale · reading + shift`; the scale is 1 where it does nothing."""
 
-    force: Float[Array, "windows steps nv"]
-    force_along: Float[Array, "windows steps nv e"]
-    scale: Float[Array, "windows rows obs"]
-    """Readings are `scale · reading + shift`: 1 where no sensor is concerned."""
-    shift: Float[Array, "windows rows obs"]
-    reading_along: Float[Array, "windows rows obs e"]
-    first_along: Float[Array, "windows n e"]
+    scale: Float[Numbers, "windows rows obs"]
+    shift: Float[Numbers, "windows rows obs"]
+    along: Float[Numbers, "windows rows obs e"]
+    first_along: Float[Numbers, "windows n e"]
     """How the motion's first state moves with what readings are restored by."""
+
+
+@struct.dataclass
+class Forcing:
+    """What a candidate adds to every row's step, and does to readings, at one point of its first e parameters.
+
+    It may have more of them, which then do nothing there.
+    """
+
+    force: Float[Numbers, "windows steps nv"]
+    along: Float[Numbers, "windows steps nv e"]
+    readings: Readings | None = None
+
+
+@struct.dataclass
+class Rest:
+    """What no candidate changes to first order: how readings over σ move with θ's z and with initial states."""
+
+    slopes: Float[Array, "windows dn rowsobs"]
+    """0 where nothing was measured."""
+    products: Float[Array, "windows dn dn"]
+    """Of the slopes, summed over rows and channels."""
 
 
 def separate(model: mujoco.MjModel, origin: Float[Array, " nq"], to: Float[Array, " nq"]) -> Float[Array, " nv"]:
@@ -135,11 +162,11 @@ def _miss(engine: Any, substeps: int, row: tuple[Array, ...], move: Array, force
 class Beside:
     """Points beside a motion from which steps are taken: k of them, the first is the motion itself."""
 
-    x: Float[Array, "k m"]
+    x: Float[Numbers, "k m"]
     """`numbers(x)` is the engine's θ."""
-    move: Float[Array, "k n"]
+    move: Float[Numbers, "k n"]
     """Of the state."""
-    force: Float[Array, "k nv"]
+    force: Float[Numbers, "k nv"]
 
 
 @trace_once(static_argnames=("engine", "numbers", "substeps"), compiler_options=COMPILER_OPTIONS)
@@ -163,14 +190,14 @@ def find_gaps(
 class Ways:
     """Which of the points lie along what; a way has its point ahead, and one behind if differences are central."""
 
-    width: Float[Array, " w"]
+    width: Float[Numbers, " w"]
     """Between the two, or from the motion to the one ahead."""
-    own: Int[Array, " e"]
+    own: Int[Numbers, " e"]
     """Ways along a candidate's own parameters, and the places of these among p; a place beyond the last is none."""
-    places: Int[Array, " e"]
-    force: Int[Array, " nv"]
-    state: Int[Array, " n"]
-    theta: Int[Array, " d"]
+    places: Int[Numbers, " e"]
+    force: Int[Numbers, " nv"]
+    state: Int[Numbers, " n"]
+    theta: Int[Numbers, " d"]
 
 
 @partial(jax.jit, static_argnames="central", compiler_options=COMPILER_OPTIONS)
@@ -185,7 +212,7 @@ def differ(
     gap = gaps[0]
     ahead, behind = (gaps[1::2], gaps[2::2]) if central else (gaps[1:], gap[None] + jnp.zeros((len(gaps) - 1, 1, 1, 1)))
 
-    def slopes(rows: Int[Array, " r"]) -> Float[Array, "windows steps n r"]:
+    def slopes(rows: Int[Numbers, " r"]) -> Float[Array, "windows steps n r"]:
         return jnp.moveaxis((ahead[rows] - behind[rows]) / ways.width[rows, None, None, None], 0, -1)
 
     theta = slopes(ways.theta) if lin is None else lin.along[..., : ways.theta.size]
@@ -224,34 +251,95 @@ def respond(lin: Linearized, windowed: Windowed, d: int) -> Float[Array, "window
 
 
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)
+def weigh(shared: Float[Array, "windows dn rowsobs"], windowed: Windowed, sigma: Float[Array, " obs"]) -> Rest:
+    """What `respond` says, over σ."""
+    weight = jnp.where(windowed.measured, 1.0 / sigma, 0.0)
+    slopes = shared * weight.reshape(len(weight), 1, -1)
+    return Rest(slopes, jnp.einsum("wik,wjk->wij", slopes, slopes))
+
+
+def _foresee(
+    lin: Linearized,
+    rest: Rest,
+    windowed: Windowed,
+    forcing: Forcing,
+    moved: Float[Array, " k"],
+    delta: Float[Array, "windows n"],
+    sigma: Float[Array, " obs"],
+) -> tuple[Float[Array, "windows rowsobs"], Float[Array, "windows e rowsobs"], Rest]:
+    """Residuals over σ, and derivatives of what is predicted over σ: along the candidate's parameters, and the rest."""
+    count, e, d = len(delta), forcing.along.shape[-1], rest.slopes.shape[1] - delta.shape[-1]
+    forced = lin.gap + jnp.einsum("wtnv,wtv->wtn", lin.b, forcing.force) + lin.along @ moved
+    columns = lin.along[..., d : d + e] + jnp.einsum("wtnv,wtvk->wtnk", lin.b, forcing.along)
+    readings = forcing.readings
+    first = jnp.zeros((*delta.shape, e)) if readings is None else readings.first_along
+    first = jnp.concatenate([delta[..., None], first], -1)
+    seen = _see(lin, windowed, first, jnp.concatenate([forced[..., None], columns], -1))
+    value, own = windowed.seen + seen[..., 0], seen[..., 1:]
+    if readings is not None:
+        value = readings.scale * value + readings.shift
+        own = readings.scale[..., None] * own + readings.along
+        slopes = rest.slopes * readings.scale.reshape(count, 1, -1)
+        rest = Rest(slopes, jnp.einsum("wik,wjk->wij", slopes, slopes))
+    weight = jnp.where(windowed.measured, 1.0 / sigma, 0.0)
+    r = jnp.where(windowed.measured, (windowed.y - value) / sigma, 0.0).reshape(count, -1)
+    return r, jnp.moveaxis((own * weight[..., None]).reshape(count, -1, e), 1, 2), rest
+
+
+@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
 def assess(
     lin: Linearized,
-    shared: Float[Array, "windows dn rowsobs"],
+    rest: Rest,
     windowed: Windowed,
     forcing: Forcing,
     moved: Float[Array, " k"],
     p: Float[Array, " k"],
     delta: Float[Array, "windows n"],
     sigma: Float[Array, " obs"],
-) -> tuple[Curvature, Float[Array, "windows rows obs"], Float[Array, "windows kn rowsobs"]]:
-    """Normal equations, residuals over σ and derivatives of what is predicted over σ.
+) -> tuple[Curvature, Float[Array, "windows rows obs"]]:
+    """Normal equations, and residuals over σ.
 
     p is [θ's z, the candidate's x], each with a standard normal prior, and `moved` how far it is from where the steps
-    were found; `shared` is what `respond` says of steps linearized there or nearby.
+    were found; `rest` is of steps linearized there or nearby. Only what the candidate changes is computed anew.
     """
-    count, d = len(delta), p.size - forcing.force_along.shape[-1]
-    forced = lin.gap + jnp.einsum("wtnv,wtv->wtn", lin.b, forcing.force) + lin.along @ moved
-    columns = lin.along[..., d:] + jnp.einsum("wtnv,wtvk->wtnk", lin.b, forcing.force_along)
-    first = jnp.concatenate([delta[..., None], forcing.first_along], -1)
-    seen = _see(lin, windowed, first, jnp.concatenate([forced[..., None], columns], -1))
-    value = forcing.scale * (windowed.seen + seen[..., 0]) + forcing.shift
-    own = forcing.scale[..., None] * seen[..., 1:] + forcing.reading_along
-    weight = jnp.where(windowed.measured, 1.0 / sigma, 0.0)
-    r = jnp.where(windowed.measured, (windowed.y - value) / sigma, 0.0)
-    own = jnp.moveaxis((own * weight[..., None]).reshape(count, -1, own.shape[-1]), 1, 2)
-    rest = shared * (forcing.scale * weight).reshape(count, 1, -1)
-    slopes = jnp.concatenate([rest[:, :d], own, rest[:, d:]], 1)
-    return normal_equations(r.reshape(count, -1), slopes, p, delta / windowed.spread), r, slopes
+    r, own, rest = _foresee(lin, rest, windowed, forcing, moved, delta, sigma)
+    (windows, n), scaled = delta.shape, delta / windowed.spread
+    d = rest.slopes.shape[1] - n
+    room = p.size - d - own.shape[1]
+    beside = jnp.einsum("wik,wjk->wij", rest.slopes, own)
+    hessian = jnp.block(
+        [[rest.products[:, :d, :d], beside[:, :d]], [jnp.swapaxes(beside[:, :d], 1, 2), own @ jnp.swapaxes(own, 1, 2)]]
+    )
+    pull = jnp.einsum("wik,wk->wi", rest.slopes, r)
+    pulls = jnp.concatenate([pull[:, :d], jnp.einsum("wik,wk->wi", own, r), jnp.zeros((windows, room))], 1)
+    cross = [rest.products[:, d:, :d], beside[:, d:], jnp.zeros((windows, n, room))]
+    curvature = Curvature(
+        cost=0.5 * ((r**2).sum() + p @ p + (scaled**2).sum()),
+        hessian=jnp.pad(hessian.sum(0), (0, room)) + jnp.eye(p.size),
+        gradient=pulls.sum(0) - p,
+        own=rest.products[:, d:, d:] + jnp.eye(n),
+        cross=jnp.concatenate(cross, -1),
+        own_gradient=pull[:, d:] - scaled,
+        pulls=pulls,
+    )
+    return curvature, r.reshape(windowed.y.shape)
+
+
+@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
+def expand_response(
+    lin: Linearized,
+    rest: Rest,
+    windowed: Windowed,
+    forcing: Forcing,
+    moved: Float[Array, " k"],
+    delta: Float[Array, "windows n"],
+    sigma: Float[Array, " obs"],
+) -> tuple[Float[Array, "windows rows obs"], Float[Array, "windows kn rowsobs"]]:
+    """Residuals over σ, and the derivatives of what is predicted over σ along p and the initial states."""
+    r, own, rest = _foresee(lin, rest, windowed, forcing, moved, delta, sigma)
+    d = rest.slopes.shape[1] - delta.shape[-1]
+    own = jnp.pad(own, ((0, 0), (0, moved.size - d - own.shape[1]), (0, 0)))
+    return r.reshape(windowed.y.shape), jnp.concatenate([rest.slopes[:, :d], own, rest.slopes[:, d:]], 1)
 
 
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from bayessim_jax.beliefs.margins import Margin, Margins
+from bayessim_jax.beliefs.margins import Margin, Margins, values_between
 from bayessim_jax.diagnosis.bench import SLOTS, Candidate, CandidatesOf, margin_of_effect
 from bayessim_jax.diagnosis.forcing import Joint, commands_of, force_of, restore_readings
 from bayessim_jax.diagnosis.response import (
@@ -26,12 +26,16 @@ from bayessim_jax.diagnosis.response import (
     Forcing,
     Linearized,
     Motion,
+    Readings,
+    Rest,
     Ways,
     Windowed,
     assess,
     differ,
+    expand_response,
     find_gaps,
     respond,
+    weigh,
 )
 from bayessim_jax.effects import Scales, at, with_effects
 from bayessim_jax.effects.contract import Numbers
@@ -52,6 +56,8 @@ MOVED = 0.15
 """How far θ's z and parameters of effects on the model may move before it is found anew where the steps lead."""
 HOMES = 8
 """Points around which the steps were linearized that are kept."""
+FEW = 3
+"""Parameters of most candidates: programs with room for no more are as many times faster."""
 
 
 @dataclass
@@ -67,6 +73,8 @@ class _Around:
     windowed: Windowed
     shared: Float[Array, "windows dn rowsobs"]
     """How readings move with θ's z and initial states."""
+    weighed: dict[bytes, Rest]
+    """The same over σ."""
     kept: dict[Any, Any] = field(default_factory=dict)
 
 
@@ -88,13 +96,7 @@ class Scene(CandidatesOf):
         self.motion, self.shots, self.d = motion, shots, margins.size
         self.parameters = [effect.parameters(place, scales[place]) for effect, place in self.pairs]
         self.margin: list[list[Margin]] = [[margin_of_effect(p) for p in each] for each in self.parameters]
-        self.kinds = [
-            tuple((p.name, m.kind) for p, m in zip(*each, strict=True))
-            for each in zip(self.parameters, self.margin, strict=True)
-        ]
-        self.ranges = [
-            (_device(np.array([m.a for m in each])), _device(np.array([m.b for m in each]))) for each in self.margin
-        ]
+        self.names = [tuple(p.name for p in each) for each in self.parameters]
         self.model = system.engine.model
         self.sites = [find_site(self.model, place) for _, place in self.pairs]
         self.edits = [k for k, (effect, _) in enumerate(self.pairs) if effect.port == "model"]
@@ -132,18 +134,41 @@ class Scene(CandidatesOf):
 
     def assess(
         self, candidate: Candidate, p: Float[np.ndarray, " k"], delta: Float[Array, "windows n"], sigma: Array
-    ) -> tuple[Curvature, Float[Array, "windows rows obs"], Float[Array, "windows kn rowsobs"]]:
-        """Normal equations at a point, residuals over σ, and derivatives of what is predicted over σ."""
+    ) -> tuple[Curvature, Float[Array, "windows rows obs"]]:
+        """Normal equations at a point, and residuals over σ."""
+        around, forcing, moved = self._force(candidate, p)
+        rest = self._weigh(around, sigma)
+        return assess(around.lin, rest, around.windowed, forcing, moved, p, delta, sigma)
+
+    def expand(
+        self, candidate: Candidate, p: Float[np.ndarray, " k"], delta: Float[Array, "windows n"], sigma: Array
+    ) -> tuple[Float[Array, "windows rows obs"], Float[Array, "windows kn rowsobs"]]:
+        """Residuals over σ at a point, and derivatives of what is predicted over σ."""
+        around, forcing, moved = self._force(candidate, p)
+        rest = self._weigh(around, sigma)
+        return expand_response(around.lin, rest, around.windowed, forcing, moved, delta, sigma)
+
+    def _weigh(self, around: _Around, sigma: Array) -> Rest:
+        """How readings over σ move with θ's z and initial states."""
+        key = np.asarray(sigma).tobytes()
+        if key not in around.weighed:
+            around.weighed[key] = weigh(around.shared, around.windowed, sigma)
+        return around.weighed[key]
+
+    def _force(self, candidate: Candidate, p: Float[np.ndarray, " k"]) -> tuple[_Around, Forcing, np.ndarray]:
+        """What a candidate exerts and distorts, and how far p is from where the steps were found."""
         motion, readings = self._restored(candidate, p)
         around = self._find_around(candidate, p, motion)
-        pushes = [push for k, place in self.offsets(candidate) for push in self._pushes(k, p, place, around)]
-        sensed = []
-        if readings:
-            raw = self._windowed(p, self.motion).seen
-            sensed = [(channel, raw[..., channel], *rest) for channel, *rest in readings]
-        forcing = _assemble(around.windowed.seen, pushes, sensed, self.model.nv, self.slots)
-        moved = np.where(self._steps(candidate), p - around.p, 0.0)
-        return assess(around.lin, around.shared, around.windowed, forcing, moved, p, delta, sigma)
+        (windows, rows, _), nv = self.motion.ctrl.shape, self.model.nv
+        size = FEW if self.count(candidate) <= FEW and not readings else self.slots
+        force, along = np.zeros((windows, rows, nv)), np.zeros((windows, rows, nv, size))
+        for k, place in self.offsets(candidate):
+            for dof, f, slopes in self._pushes(k, p, place, around):
+                force[..., dof] += f
+                along[..., dof, place.start - self.d : place.stop - self.d] += slopes
+        raw = np.asarray(self._windowed(p, self.motion).seen) if readings else np.zeros(0)
+        forcing = Forcing(force, along, _distort(np.asarray(around.windowed.seen), raw, readings, nv, size))
+        return around, forcing, np.where(self._steps(candidate), p - around.p, 0.0)
 
     def states(self, delta: Float[Array, "windows n"]) -> list[Float[Array, "windows n"]]:
         """Initial states to begin from beside those of a fit: none, for every fit is close to the recorded motion."""
@@ -216,8 +241,8 @@ class Scene(CandidatesOf):
         gaps = find_gaps(self.engine, self.numbers, motion, beside, count, self.system.substeps)
         lin = differ(base.lin if base else None, gaps, ways, forced, self.step > 0.0)
         kept, windowed = np.where(self._steps(candidate), p, 0.0), self._windowed(p, motion)
-        shared = base.shared if base else respond(lin, windowed, self.d)
-        return _Around(self._edits(candidate), kept, motion, lin, windowed, shared)
+        shared, weighed = (base.shared, base.weighed) if base else (respond(lin, windowed, self.d), {})
+        return _Around(self._edits(candidate), kept, motion, lin, windowed, shared, weighed)
 
     def _look_beside(
         self, candidate: Candidate, p: Float[np.ndarray, " k"], moves: Sequence[int], forced: bool, whole: bool
@@ -245,10 +270,8 @@ class Scene(CandidatesOf):
         own[:m], places[:m] = np.arange(m), moves
         after = m + np.arange(3 * nv + d)
         used = m + nv * forced + (2 * nv + d) * whole
-        beside = Beside(*(_device(x) for x in (points, move, force)))
-        which = map(jax.device_put, (own, places, after[:nv], after[nv : 3 * nv], after[3 * nv :]))
-        ways = Ways(_device(len(sides) * width), *which)
-        return 1 + len(sides) * used, beside, ways
+        ways = Ways(len(sides) * width, own, places, after[:nv], after[nv : 3 * nv], after[3 * nv :])
+        return 1 + len(sides) * used, Beside(points, move, force), ways
 
     def _find_around(self, candidate: Candidate, p: Float[np.ndarray, " k"], motion: Motion) -> _Around:
         """Steps around the motion: those of before, where neither the motion nor the model has changed much."""
@@ -270,61 +293,65 @@ class Scene(CandidatesOf):
         return Windowed(self.shots.y, self.shots.measured, seen, c, self.shots.spread)
 
     @cached_property
-    def _rates(self) -> tuple[Array, Array]:
-        """Accelerations and their rates along the motion."""
+    def _rates(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Times of all rows, and accelerations and their rates along the motion."""
+        rows = np.asarray(self.motion.start)[:, None] + self.system.dt * np.arange(self.motion.qpos.shape[1])
         acceleration = np.gradient(np.asarray(self.motion.qvel), self.system.dt, axis=1)
-        return _device(acceleration), _device(np.gradient(acceleration, self.system.dt, axis=1))
+        return rows, acceleration, np.gradient(acceleration, self.system.dt, axis=1)
 
-    def _restored(self, candidate: Candidate, p: np.ndarray) -> tuple[Motion, list[tuple[Any, ...]]]:
-        """The true motion behind what sensors with effects showed.
-
-        Of every reading: channel, degree of freedom, ∂q/∂x, ∂v/∂x, ∂q/∂reading, first of x among own numbers.
-        """
-        motion, readings = self.motion, []
-        for k, place in self.offsets(candidate):
+    def _restored(self, candidate: Candidate, p: np.ndarray) -> tuple[Motion, list[_Reading]]:
+        """The true motion behind what sensors with effects showed, and what these do to readings of it."""
+        sensors = [(k, place) for k, place in self.offsets(candidate) if self.pairs[k][0].port == "sense"]
+        if not sensors:
+            return self.motion, []
+        qpos, qvel, readings = np.array(self.motion.qpos), np.array(self.motion.qvel), []
+        channels = [c.name for c in self.system.channels]
+        for k, place in sensors:
             effect, name = self.pairs[k]
-            if effect.port != "sense":
-                continue
-            joint = self.sites[k].joint
-            q, v = int(self.model.jnt_qposadr[joint]), int(self.model.jnt_dofadr[joint])
-            channels = [c.name for c in self.system.channels]
-            rows = np.asarray(motion.start)[:, None] + self.system.dt * np.arange(motion.qpos.shape[1])
-            seen = (motion.qpos[..., q], motion.qvel[..., v], *(rate[..., v] for rate in self._rates))
+            q, v = int(self.model.jnt_qposadr[self.sites[k].joint]), self._dof(self.sites[k].joint)
             prompt = has_rate(name, channels)
-            new_q, new_v, along, along_v, slope = restore_readings(
-                effect, self.kinds[k], self.system.dt, prompt, p[place], *self.ranges[k], rows, *seen
+            rows, *rates = self._rates
+            seen = (rows, qpos[..., q], qvel[..., v], *(rate[..., v] for rate in rates))
+            found = restore_readings(
+                effect, self.names[k], self.system.dt, prompt, *self._numbers_at(k, p[place]), *seen
             )
-            qpos, qvel = motion.qpos.at[..., q].set(new_q), motion.qvel
+            qpos[..., q], new_v, along, along_v, slope = found
             if prompt:
-                along_v = jnp.zeros_like(along_v)
+                along_v = np.zeros_like(along_v)
             else:
-                qvel = qvel.at[..., v].set(new_v)
-            motion = dataclasses.replace(motion, qpos=qpos, qvel=qvel)
-            readings.append((channels.index(at(name)), v, along, along_v, slope, place.start - self.d))
-        return motion, readings
+                qvel[..., v] = new_v
+            own = slice(place.start - self.d, place.stop - self.d)
+            readings.append(_Reading(channels.index(at(name)), v, own, along, along_v, slope))
+        return dataclasses.replace(self.motion, qpos=_device(qpos), qvel=_device(qvel)), readings
 
-    def _pushes(self, e: int, p: np.ndarray, place: slice, around: _Around) -> list[tuple[Any, ...]]:
-        """What an effect exerts: degree of freedom, force, derivatives along x, first of x among own numbers."""
+    def _pushes(
+        self, e: int, p: np.ndarray, place: slice, around: _Around
+    ) -> list[tuple[int, Float[np.ndarray, "windows steps"], Float[np.ndarray, "windows steps e"]]]:
+        """What an effect exerts: degree of freedom, force, and its derivatives along the effect's x."""
         effect, site = self.pairs[e][0], self.sites[e]
         if effect.port not in ("force", "act"):
             return []
         joint = self._joint(site.joint, around, site.actuators if effect.port == "force" else ())
-        kinds, x, (low, high) = self.kinds[e], p[place], self.ranges[e]
+        names, numbers = self.names[e], self._numbers_at(e, p[place])
         if effect.port == "force":
             other = self._joint(site.other, around, ()) if site.other >= 0 else None
             earlier = self._earlier(site.joint, around) if effect.recalls else None
-            seen = (self.h, self.fine, x, low, high, self.times, joint, other, earlier, self.system.dt)
-            f, along = force_of(effect, kinds, site.detail, *seen)
-            return [(self._dof(site.joint), f, along, place.start - self.d)]
+            seen = (self.h, self.fine, *numbers, self.times, joint, other, earlier, self.system.dt)
+            f, along = force_of(effect, names, site.detail, *seen)
+            return [(self._dof(site.joint), f, along)]
         gains = self._gains(site.actuators, around)
         commands, older, coarse, before = self._commands(site.actuators, effect.looks)
-        f, along = commands_of(
-            effect, kinds, self.h, self.fine, before, coarse, x, low, high, self.times, joint, commands, older, gains
-        )
+        seen = (self.h, self.fine, before, coarse, *numbers, self.times, joint, commands, older, gains)
+        f, along = commands_of(effect, names, *seen)
         return [
-            (self._dof(int(self.model.actuator_trnid[actuator, 0])), f[..., i], along[..., i, :], place.start - self.d)
+            (self._dof(int(self.model.actuator_trnid[actuator, 0])), f[..., i], along[..., i, :])
             for i, actuator in enumerate(site.actuators)
         ]
+
+    def _numbers_at(self, e: int, x: Float[np.ndarray, " k"]) -> tuple[np.ndarray, np.ndarray]:
+        """An effect's parameters in their units, and how they grow with x."""
+        pairs = list(zip(self.margin[e], x.tolist(), strict=True))
+        return np.array([m.value(z) for m, z in pairs]), np.array([m.slope(z) for m, z in pairs])
 
     def _dof(self, joint: int) -> int:
         return int(self.model.jnt_dofadr[joint])
@@ -345,7 +372,7 @@ class Scene(CandidatesOf):
 
     def _numbers(self, around: _Around) -> Numbers:
         """The model's numbers at the θ that the steps were linearized at."""
-        theta = self.margins.theta(jnp.asarray(around.p[: self.d]))
+        theta = self.margins.theta(around.p[: self.d])
         return read_numbers(self.model, self.system.engine.writes, theta)
 
     def _gains(self, actuators: Sequence[int], around: _Around) -> Float[np.ndarray, " act"]:
@@ -413,11 +440,8 @@ class _EngineNumbers:
         if not m:
             return self.margins.theta(full)
         x, on, low, high, neutral = (full[d + i * m : d + (i + 1) * m] for i in range(5))
-        values = [
-            jnp.where(on[i] > 0.5, Margin(kind, 0.0, 1.0).between(low[i], high[i]).value(x[i]), neutral[i])
-            for i, kind in enumerate(self.kinds)
-        ]
-        theta = jnp.concatenate([self.margins.theta(full[:d]), jnp.stack(values)])
+        values = jnp.where(on > 0.5, values_between(self.kinds, low, high, x), neutral)
+        theta = jnp.concatenate([self.margins.theta(full[:d]), values])
         return edit_model(self.engine.model, self.writes, self.wired, theta, d)
 
     def __eq__(self, other: object) -> bool:
@@ -485,39 +509,40 @@ def _look_back(
     return position, velocity, drive + jnp.zeros_like(position)
 
 
-@partial(jax.jit, static_argnames=("nv", "size"), compiler_options=COMPILER_OPTIONS)
-def _assemble(
-    seen: Float[Array, "windows rows obs"],
-    pushes: Sequence[tuple[Any, ...]],
-    sensed: Sequence[tuple[Any, ...]],
+@dataclass
+class _Reading:
+    """How an effect distorts a sensor's readings, s(x, q(x, r)) = r, of the motion that is restored from them."""
+
+    channel: int
+    dof: int
+    own: slice
+    """Of the effect's numbers among those of the candidate."""
+    along: Float[np.ndarray, "windows rows e"]
+    """∂q/∂x, and ∂v/∂x."""
+    along_v: Float[np.ndarray, "windows rows e"]
+    slope: Float[np.ndarray, "windows rows"]
+    """∂q/∂reading."""
+
+
+def _distort(
+    seen: Float[np.ndarray, "windows rows obs"],
+    raw: Float[np.ndarray, "windows rows obs"],
+    readings: Sequence[_Reading],
     nv: int,
     size: int,
-) -> Forcing:
-    """What effects exert and distort, put together.
-
-    A distorted reading of a restored motion is what it was restored from: s(x, q(x, r)) = r.
-    """
-    windows, rows, _ = seen.shape
-    force, along = jnp.zeros((windows, rows - 1, nv)), jnp.zeros((windows, rows - 1, nv, size))
-    for dof, f, slopes, first in pushes:
-        at_dof = jnp.arange(nv) == dof
-        place = jnp.arange(size) == first + jnp.arange(slopes.shape[-1])[:, None]
-        force = force + f[..., None] * at_dof
-        along = along + jnp.einsum("wte,ek,v->wtvk", slopes, place.astype(float), at_dof.astype(float))
-    scale, shift, reading_along = jnp.ones_like(seen), jnp.zeros_like(seen), jnp.zeros((*seen.shape, size))
-    first_along = jnp.zeros((windows, 2 * nv, size))
-    for channel, raw, dof, own, own_v, slope, first in sensed:
-        here = jnp.arange(seen.shape[-1]) == channel
-        place = jnp.arange(size) == first + jnp.arange(own.shape[-1])[:, None]
-        s = 1.0 / slope
-        scale = jnp.where(here, s[..., None], scale)
-        shift = jnp.where(here, (raw[..., None] - s[..., None] * seen), shift)
-        moved = jnp.einsum("wte,ek->wtk", -s[..., None] * own, place.astype(float))
-        reading_along = reading_along + here[:, None] * moved[:, :, None]
-        state = jnp.arange(2 * nv)[:, None] == jnp.array([dof, nv + dof])
-        begun = jnp.stack([own[:, 0], own_v[:, 0]], 1)
-        first_along = first_along + jnp.einsum("nd,wde,ek->wnk", state.astype(float), begun, place.astype(float))
-    return Forcing(force, along, scale, shift, reading_along, first_along)
+) -> Readings | None:
+    """What sensors with effects show: `raw` where the true ones show `seen`."""
+    if not readings:
+        return None
+    scale, shift, along = np.ones_like(seen), np.zeros_like(seen), np.zeros((*seen.shape, size))
+    first = np.zeros((len(seen), 2 * nv, size))
+    for each in readings:
+        here, s = (..., each.channel), 1.0 / each.slope
+        scale[here], shift[here] = s, raw[here] - s * seen[here]
+        along[(*here, each.own)] -= s[..., None] * each.along
+        first[:, each.dof, each.own] += each.along[:, 0]
+        first[:, nv + each.dof, each.own] += each.along_v[:, 0]
+    return Readings(scale, shift, along, first)
 
 
 def _see_one(system: MjcfSystem, theta: Array, qpos: Array, qvel: Array, ctrl: Array) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from bayessim_jax.diagnosis.bench import NEAR, Candidate, begin_point
 from bayessim_jax.diagnosis.response import propose
@@ -104,7 +104,7 @@ class Screen:
             together = [k for k, (p, _) in enumerate(each) if p.scan and p.unit == unit]
             shares = (np.arange(each[together[0]][0].scan) + 1.0) / (each[together[0]][0].scan + 1.0)
             apart = (np.arange(len(together)) - 0.5 * (len(together) - 1)) / len(shares)
-            places = norm.ppf(np.clip(shares[:, None] + apart, EDGE, 1.0 - EDGE))
+            places = ndtri(np.clip(shares[:, None] + apart, EDGE, 1.0 - EDGE))
             grids.append([list(zip(together, place, strict=True)) for place in places])
         for chosen in product(*grids) if grids else ():
             point = begin.copy()
@@ -145,7 +145,7 @@ class Screen:
             cost = float(there[0].cost)
             if np.isfinite(cost) and (here is None or cost <= float(here[2].cost)):
                 gain = np.inf if here is None else (float(here[2].cost) - cost) / max(abs(cost), 1e-12)
-                here, damping = (*tried, *there[:2]), max(damping / 5, 1e-9)
+                here, damping = (*tried, *there), max(damping / 5, 1e-9)
                 if gain < 1e-4:
                     break
             elif here is None:
@@ -262,7 +262,7 @@ class Screen:
     def misfit(self, key: PRNGKeyArray, found: Screened) -> Misfit:
         """What a candidate leaves of the misfit."""
         self.scene.begin_around(found.candidate, found.p)
-        _, r, slopes = self.scene.assess(found.candidate, np.asarray(found.p), found.delta, found.sigma)
+        r, slopes = self.scene.expand(found.candidate, np.asarray(found.p), found.delta, found.sigma)
         n = found.delta.shape[-1]
         own = in_units(np.asarray(slopes)[:, -n:], found.sigma)
         residual = np.asarray(r) * np.asarray(found.sigma)

@@ -17,7 +17,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from bayessim_jax.beliefs.margins import Margin
+from bayessim_jax.beliefs.margins import Margin, values_between
 from bayessim_jax.diagnosis.bench import Bench, Candidate, CandidatesOf
 from bayessim_jax.effects import with_effects
 from bayessim_jax.effects.commanded import EVERY
@@ -78,8 +78,19 @@ class SimulatedScene(CandidatesOf):
 
     def assess(
         self, candidate: Candidate, p: Float[np.ndarray, " k"], delta: Float[Array, "windows n"], sigma: Array
-    ) -> tuple[Curvature, Float[Array, "windows rows obs"], Float[Array, "windows kn rowsobs"]]:
-        """Normal equations at a point, residuals over σ, and derivatives of what is predicted over σ."""
+    ) -> tuple[Curvature, Float[Array, "windows rows obs"]]:
+        """Normal equations at a point, and residuals over σ."""
+        return self._expand(candidate, p, delta, sigma)[:2]
+
+    def expand(
+        self, candidate: Candidate, p: Float[np.ndarray, " k"], delta: Float[Array, "windows n"], sigma: Array
+    ) -> tuple[Float[Array, "windows rows obs"], Float[Array, "windows kn rowsobs"]]:
+        """Residuals over σ at a point, and derivatives of what is predicted over σ."""
+        return self._expand(candidate, p, delta, sigma)[1:]
+
+    def _expand(
+        self, candidate: Candidate, p: np.ndarray, delta: Array, sigma: Array
+    ) -> tuple[Curvature, Array, Array]:
         if candidate not in self._shots:
             self._shots[candidate] = self.setup(candidate)
         return _assess(self.predict, self._shots[candidate], jnp.asarray(p), delta, sigma)
@@ -116,8 +127,8 @@ def _predict_chosen(bench: Bench) -> Any:
         z = jnp.zeros(d + len(each) + 1, x.dtype).at[chosen.index].set(x)
         theta = margins.theta(z[:d])
         if each:
-            own = [m.between(chosen.low[k], chosen.high[k]).value(z[d + k]) for k, m in enumerate(each)]
-            theta = jnp.concatenate([theta, jnp.where(chosen.on, jnp.stack(own), chosen.neutral)])
+            own = values_between([m.kind for m in each], chosen.low, chosen.high, z[d : d + len(each)])
+            theta = jnp.concatenate([theta, jnp.where(chosen.on, own, chosen.neutral)])
         return replay_window(union, theta, delta, chosen.window)
 
     return predict

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import blackjax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -293,6 +292,8 @@ def _walk(
 @partial(jax.jit, static_argnames="predict", compiler_options=COMPILER_OPTIONS)
 def _chains(key: PRNGKeyArray, predict: Predict, shots: Shots, around: Ridge, first: Array, factor: Array) -> Array:
     """Random-walk Metropolis chains, side by side; the second half of each. Steps of many lengths pass bends."""
+    with jax.ensure_compile_time_eval():
+        import blackjax  # imported late: chains are the last resort
 
     def stride(key: Any, position: Array) -> Array:
         length_key, way_key = jax.random.split(key)

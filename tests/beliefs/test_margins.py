@@ -46,3 +46,16 @@ def test_values_outside_of_the_support_go_to_its_edge():
     assert bool(jnp.isfinite(z).all())
     np.testing.assert_allclose(margins.theta(z), [1.0, 0.0], atol=1e-5)
     assert log_normal(0.0, 1.0).value(jnp.array(0.0)) == 1.0
+
+
+def test_values_of_many_margins_are_those_of_each():
+    each = [uniform(-1.0, 2.0), log_uniform(0.1, 9.0), normal(1.0, 0.2), uniform(0.0, 0.5), log_normal(0.3, 0.4)]
+    z = np.array([0.3, -1.2, 0.7, 2.0, -0.4])
+    with jax.enable_x64(True):
+        for some in (each, each[:1], [each[0], each[3]], [*each[:4], normal(1.0, 0.2, low=0.9)]):
+            margins = Margins.create([str(k) for k in range(len(some))], some)
+            asked = np.array([m.value(x) for m, x in zip(some, z, strict=False)])
+            np.testing.assert_allclose(margins.theta(jnp.asarray(z[: len(some)])), asked, rtol=1e-12)
+            found = margins.theta(z[: len(some)])
+            assert isinstance(found, np.ndarray)
+            np.testing.assert_allclose(found, asked, rtol=1e-12)

@@ -14,7 +14,7 @@ from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.effects import EFFECTS, Scales
 from bayessim_jax.inference.direct import estimate_noise
 from bayessim_jax.inference.replay import replay_window
-from bayessim_jax.inference.shooting import predict_all, solve
+from bayessim_jax.inference.shooting import normal_equations, predict_all, solve
 from bayessim_jax.recordings.loading import load_case
 from bayessim_jax.recordings.shots import case_model
 from benchmarks.worlds import make_case
@@ -70,12 +70,30 @@ def test_the_screen_knows_what_a_sensors_error_changes_in_the_first_state_too(pr
     def residuals(x):
         moved = p.copy()
         moved[scene.d] = x
-        return scene.assess(free, moved, still, sigma)
+        return scene.expand(free, moved, still, sigma)
 
-    _, here, slopes = residuals(0.0)
+    here, slopes = residuals(0.0)
     slope = np.asarray(slopes)[:, scene.d].reshape(here.shape)
-    beside = (np.asarray(residuals(1e-4)[1]) - np.asarray(residuals(-1e-4)[1])) / 2e-4
+    beside = (np.asarray(residuals(1e-4)[0]) - np.asarray(residuals(-1e-4)[0])) / 2e-4
     np.testing.assert_allclose(-slope, beside, atol=0.1 * np.abs(beside).max())
+
+
+@pytest.mark.parametrize("effects", [(0,), (1, 2), (2,)])
+def test_normal_equations_are_those_of_all_derivatives(problem, effects):
+    place = "joint/hinge/qpos"
+    scales = problem.scales | {place: Scales(timestep=0.002, period=0.004)}
+    pairs = [*problem.pairs[:2], (EFFECTS["sensor_offset"], place)]
+    scene = dataclasses.replace(problem, scales=scales).screen(pairs).scene
+    rng = np.random.default_rng(0)
+    sigma = jnp.full(len(problem.system.channels), 0.1)
+    candidate, p = Candidate(effects), np.zeros(scene.d + scene.slots)
+    p[: scene.d + scene.count(candidate)] = 0.1 * rng.normal(size=scene.d + scene.count(candidate))
+    delta = jnp.asarray(0.1 * rng.normal(size=(len(scene.motion.start), 2)) * np.asarray(scene.shots.spread))
+    curvature, r = scene.assess(candidate, p, delta, sigma)
+    seen, slopes = scene.expand(candidate, p, delta, sigma)
+    np.testing.assert_allclose(r, seen, atol=1e-12)
+    asked = normal_equations(seen.reshape(len(seen), -1), slopes, jnp.asarray(p), delta / scene.shots.spread)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), curvature, asked)
 
 
 def predicted(bench, candidate, x):

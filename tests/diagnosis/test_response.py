@@ -18,6 +18,7 @@ from bayessim_jax.diagnosis.response import (
     find_gaps,
     respond,
     separate,
+    weigh,
 )
 from bayessim_jax.effects import EFFECTS, Moment, Scales
 from bayessim_jax.systems.mjcf import Unknown, displace, mjcf_system
@@ -70,11 +71,9 @@ def test_the_response_to_a_force_is_the_simulators_to_first_order(arm):
             jnp.eye(4) * jnp.ones((1, STEPS + 1, 1, 1)),
             jnp.ones(4),
         )
-        none = jnp.zeros((1, STEPS + 1, 4))
-        still = jnp.zeros((1, 4, 1))
-        forcing = Forcing(size * push[None], jnp.zeros((1, STEPS, 2, 1)), none + 1.0, none, none[..., None], still)
-        shared = respond(lin, seen, 0)
-        _, r, _ = assess(lin, shared, seen, forcing, jnp.zeros(1), jnp.zeros(1), jnp.zeros((1, 4)), jnp.ones(4))
+        forcing = Forcing(size * push[None], jnp.zeros((1, STEPS, 2, 1)))
+        rest = weigh(respond(lin, seen, 0), seen, jnp.ones(4))
+        _, r = assess(lin, rest, seen, forcing, jnp.zeros(1), jnp.zeros(1), jnp.zeros((1, 4)), jnp.ones(4))
         errors.append(float(jnp.abs(r).max() / jnp.abs(moved - plain).max()))
     assert errors[1] < 1e-3
     assert errors[1] < 0.2 * errors[0]
@@ -177,29 +176,28 @@ class Lingering(FlexibleForce):
 def test_slopes_along_many_parameters_are_those_of_differences(effect):
     time, joint = along(jnp.linspace(-3.0, 3.0, 40)[None])
     parameters = effect.parameters("joint/a", Scales())
-    kinds = tuple((p.name, "uniform") for p in parameters)
-    low, high = (jnp.array([getattr(p, side) for p in parameters]) for side in ("low", "high"))
-    x = 0.3 * jax.random.normal(jax.random.key(0), (len(parameters),))
-    at = lambda x: force_of(effect, kinds, "", 0.002, 2, x, low, high, time, joint, None)  # noqa: E731
+    names, rates = tuple(p.name for p in parameters), 1.0 + np.arange(len(parameters)) / 7.0
+    middle = np.array([0.5 * (p.low + p.high) for p in parameters])
+    x = middle + 0.1 * np.random.default_rng(0).normal(size=middle.size) * [p.high - p.low for p in parameters]
+    at = lambda x: force_of(effect, names, "", 0.002, 2, x, rates, time, joint, None)  # noqa: E731
     force, slopes = at(x)
     assert force.shape == (1, 20) and slopes.shape == (1, 20, len(parameters))
     for k in (0, 7, 20, len(parameters) - 1):
-        ahead, behind = (at(x.at[k].add(s))[0] for s in (1e-5, -1e-5))
-        np.testing.assert_allclose(slopes[..., k], (ahead - behind) / 2e-5, atol=1e-7)
+        ahead, behind = (at(x + s * rates * (np.arange(x.size) == k))[0] for s in (1e-5, -1e-5))
+        np.testing.assert_allclose(slopes[..., k], (ahead - behind) / 2e-5, atol=1e-6)
 
 
 def test_friction_along_a_motion_opposes_it_and_grows_with_its_level():
     velocity = jnp.linspace(-3.0, 3.0, 40)[None]
     time, joint = along(velocity)
-    low, high = jnp.array([0.0]), jnp.array([1.0])
-    kinds = (("coulomb", "uniform"),)
-    effect = EFFECTS["coulomb_friction"]
-    force, slopes = force_of(effect, kinds, "", 0.002, 2, jnp.zeros(1), low, high, time, joint, None)
+    effect, rate = EFFECTS["coulomb_friction"], np.array([0.4])
+    at = lambda level: force_of(effect, ("coulomb",), "", 0.002, 2, np.array([level]), rate, time, joint, None)  # noqa: E731
+    force, slopes = at(0.5)
     assert force.shape == (1, 20) and slopes.shape == (1, 20, 1)
     rows = np.asarray(velocity[0]).reshape(20, 2).mean(1)
     moving = np.abs(rows) > 0.5
     np.testing.assert_allclose(np.asarray(force[0])[moving], -0.5 * np.sign(rows[moving]), rtol=1e-6)
-    beside = force_of(effect, kinds, "", 0.002, 2, jnp.full(1, 1e-5), low, high, time, joint, None)[0]
+    beside = at(0.5 + 0.4e-5)[0]
     np.testing.assert_allclose((beside - force)[0] / 1e-5, slopes[0, :, 0], rtol=1e-3, atol=1e-6)
 
 
@@ -207,12 +205,9 @@ def test_friction_along_a_motion_opposes_it_and_grows_with_its_level():
 def test_a_lag_along_the_commands_is_the_difference_of_two_equations(long_ago):
     commands, older = jnp.ones((1, 60, 1)).at[:, :20].set(0.0), jnp.full((1, 7, 1), long_ago)
     time, joint = along(jnp.zeros((1, 40)))
-    kinds = (("time_constant", "uniform"),)
-    low, high, x = jnp.array([0.0]), jnp.array([0.08]), jnp.zeros(1)
-    effect = EFFECTS["actuator_lag"]
-    changes, _ = commands_of(
-        effect, kinds, 0.002, 2, 20, 0.01, x, low, high, time, joint, commands, older, jnp.array([3.0])
-    )
+    effect, numbers = EFFECTS["actuator_lag"], (np.array([0.04]), np.ones(1))
+    seen = (time, joint, commands, older, jnp.array([3.0]))
+    changes, _ = commands_of(effect, ("time_constant",), 0.002, 2, 20, 0.01, *numbers, *seen)
     assert changes.shape == (1, 20, 1)
     after = 0.002 * (np.arange(40).reshape(20, 2).mean(1) + 0.5)
     held = long_ago * np.exp(-1.0) - 1.0
@@ -222,13 +217,10 @@ def test_a_lag_along_the_commands_is_the_difference_of_two_equations(long_ago):
 def test_a_scaled_sensor_is_undone_with_its_derivatives():
     q = jnp.linspace(-1.0, 1.0, 11)[None]
     still = jnp.zeros_like(q)
-    low, high = jnp.array([0.5]), jnp.array([2.0])
-    kinds, x = (("scale", "uniform"),), jnp.zeros(1)
-    true, _, along_x, _, slope = restore_readings(
-        EFFECTS["sensor_scale"], kinds, 0.004, False, x, low, high, still, q, still, still, still
-    )
+    seen = (still, q, still, still, still)
+    numbers = (np.array([1.25]), np.array([0.6]))
+    true, _, along_x, _, slope = restore_readings(EFFECTS["sensor_scale"], ("scale",), 0.004, False, *numbers, *seen)
     np.testing.assert_allclose(true, q / 1.25, rtol=1e-10)
     np.testing.assert_allclose(slope, 1 / 1.25, rtol=1e-10)
-    density = 1.5 / np.sqrt(2 * np.pi)
-    np.testing.assert_allclose(along_x[..., 0], -q / 1.25**2 * density, rtol=1e-6)
+    np.testing.assert_allclose(along_x[..., 0], -0.6 * q / 1.25**2, rtol=1e-6)
     assert Moment(still, 0.1).position == 0.0
