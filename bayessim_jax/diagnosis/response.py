@@ -223,21 +223,26 @@ def differ(
     return Linearized(lin.a, jnp.where(forced, slopes(ways.force), lin.b), along, gap)
 
 
-def _propagate(a: Array, first: Float[Array, "n k"], added: Float[Array, "steps n k"]) -> Float[Array, "rows n k"]:
-    """e_{t+1} = A_t e_t + g_t, for several columns at once."""
-
-    def once(e: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
-        after = now[0] @ e + now[1]
-        return after, after
-
-    return jnp.concatenate([first[None], jax.lax.scan(once, first, (a, added))[1]])
-
-
 def _see(
     lin: Linearized, windowed: Windowed, first: Float[Array, "windows n k"], added: Float[Array, "windows steps n k"]
 ) -> Float[Array, "windows rows obs k"]:
-    """What the sensors show of several deviations."""
-    return jnp.einsum("wton,wtnk->wtok", windowed.c, jax.vmap(_propagate)(lin.a, first, added))
+    """What the sensors show of several deviations, e_{t+1} = A_t e_t + g_t.
+
+    Windows lie along the last axis, where a processor's vectors take several at once, and sums over the few
+    coordinates of a state are written out: as products of small matrices they take three times as long.
+    """
+    first, added = (jnp.moveaxis(x, 0, -1) for x in (first, added))
+    a, c = (jnp.transpose(x, (1, 3, 2, 0)) for x in (lin.a, windowed.c))
+
+    def apply(by: Float[Array, "... n m windows"], e: Float[Array, "... n k windows"]) -> Array:
+        return sum(by[..., j, :, None, :] * e[..., j, None, :, :] for j in range(e.shape[-3]))  # pyright: ignore[reportReturnType]
+
+    def once(e: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
+        after = apply(now[0], e) + now[1]
+        return after, after
+
+    e = jnp.concatenate([first[None], jax.lax.scan(once, first, (a, added))[1]])
+    return jnp.moveaxis(apply(c, e), -1, 0)
 
 
 @partial(jax.jit, static_argnames="d", compiler_options=COMPILER_OPTIONS)
@@ -306,12 +311,14 @@ def assess(
     (windows, n), scaled = delta.shape, delta / windowed.spread
     d = rest.slopes.shape[1] - n
     room = p.size - d - own.shape[1]
-    beside = jnp.einsum("wik,wjk->wij", rest.slopes, own)
+    both = jnp.concatenate([own, r[:, None]], 1)
+    along_rest = jnp.einsum("wik,wjk->wij", rest.slopes, both)
+    along_own = jnp.einsum("wik,wjk->wij", own, both)
+    beside, pull = along_rest[..., :-1], along_rest[..., -1]
     hessian = jnp.block(
-        [[rest.products[:, :d, :d], beside[:, :d]], [jnp.swapaxes(beside[:, :d], 1, 2), own @ jnp.swapaxes(own, 1, 2)]]
+        [[rest.products[:, :d, :d], beside[:, :d]], [jnp.swapaxes(beside[:, :d], 1, 2), along_own[..., :-1]]]
     )
-    pull = jnp.einsum("wik,wk->wi", rest.slopes, r)
-    pulls = jnp.concatenate([pull[:, :d], jnp.einsum("wik,wk->wi", own, r), jnp.zeros((windows, room))], 1)
+    pulls = jnp.concatenate([pull[:, :d], along_own[..., -1], jnp.zeros((windows, room))], 1)
     cross = [rest.products[:, d:, :d], beside[:, d:], jnp.zeros((windows, n, room))]
     curvature = Curvature(
         cost=0.5 * ((r**2).sum() + p @ p + (scaled**2).sum()),
