@@ -203,8 +203,9 @@ class GainDrop(ActLaw):
 
     @classmethod
     def make(cls, spot: Spot, amplitude: float, rng: np.random.Generator) -> GainDrop:
-        """In the middle of the recording; to more or to less."""
-        return cls(spot, rng.uniform(0.25, 0.6) * spot.duration, _gain(amplitude, rng))
+        """In the middle of the recording; to less, or to more, which is at most twice as much."""
+        change = amplitude / (1.0 + amplitude)
+        return cls(spot, rng.uniform(0.25, 0.6) * spot.duration, 1.0 + rng.choice([-1.0, 1.0]) * change)
 
     def command(self, world: World, u: float) -> float:
         """The command, or the product."""

@@ -33,6 +33,7 @@ from bayessim_jax.diagnosis.verdict import (
     explains,
     has_special_case,
     is_worth,
+    may_be_named,
     share_left,
 )
 from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, judge_misfit
@@ -53,11 +54,13 @@ NUMBERS = 15_000
 FINALISTS, LEADERS, PAIRS = 7, 2, 4
 """Single effects that are simulated at most, at least, and pairs."""
 RACED, PLACES = 40, 2
-"""Single effects, and places of each effect, that go on after their first steps along the motion."""
+"""Candidates, and places of each effect, that go on after their first steps along the motion."""
 FINISHED = 14
 """Single effects that are fitted to the end along the motion."""
 GLANCED = 4
 """Partners of a leader that are fitted to the end."""
+GLANCING, FIRST_STEPS = 6, 2
+"""Steps of the solver by which partners are ranked, and those by which many of them are at first."""
 WIDEST = 4
 """Effects of a set."""
 SIMPLE, AGAIN = 2, 4
@@ -274,9 +277,13 @@ class _Growth:
         larger = len(known.candidate.effects) + 1
         tried = [s for s in wider if len(s.effects) == larger and s not in self.seen and first.takes(s)]
         self.seen.update(tried)
-        costs = _each(self.screens, tried, lambda screen, s: screen.glance(s, known, self.alone.get(wider[s])))
-        finite = [(cost, s) for cost, s in zip(costs, tried, strict=True) if np.isfinite(cost)]
-        best = [s for _, s in sorted(finite, key=lambda item: item[0])[:GLANCED]]
+        many = len(tried) > RACED
+        begin = {s: first.beside(s, known, self.alone.get(wider[s])) for s in tried}
+        glanced = self._glance(known, begin, FIRST_STEPS if many else GLANCING)
+        if many:
+            going = [list(glanced)[i] for i in _promising(first, [wider[s] for s in glanced])]
+            glanced = self._glance(known, {s: [end[1:] for end in glanced[s]] for s in going}, GLANCING)
+        best = list(glanced)[:GLANCED]
         # a glance may miss what its general case shows
         best += [s for s in tried if s not in best and any(self._is_special_case(wider[s], wider[b]) for b in best)]
 
@@ -292,6 +299,14 @@ class _Growth:
             return screen.finish_candidate(raced, beside) if raced is not None else None
 
         return [each for each in _each(self.screens, [*grown, *split], finish) if each is not None]
+
+    def _glance(
+        self, known: Screened, ends: Mapping[Candidate, Sequence[tuple[Any, Array]]], steps: int
+    ) -> dict[Candidate, list[tuple[float, Any, Array]]]:
+        """What a few steps lead to from points of every candidate: cost, p and δ; the best candidates first."""
+        found = _each(self.screens, list(ends), lambda screen, s: screen.glance(s, known, ends[s], steps))
+        finite = [(s, each) for s, each in zip(ends, found, strict=True) if each]
+        return dict(sorted(finite, key=lambda item: item[1][0][0]))
 
     def _is_special_case(self, effect: int, other: int) -> bool:
         """Whether an effect is a special case of another one at the same joint."""
@@ -343,7 +358,7 @@ def _rank(
         return sorted(finite, key=lambda begun: -begun.likelihood)
 
     begun = ranked(_each(screens, singles, begin))
-    ahead = _promising(screens[0], begun)
+    ahead = [begun[i] for i in _promising(screens[0], [each.candidate.effects[0] for each in begun])]
     raced = _each(screens, ahead, lambda screen, begun: screen.resume_candidate(begun, nothing))
     going = {each.candidate for each in ahead}
     every = ranked([*raced, *(each for each in begun if each.candidate not in going)])
@@ -351,15 +366,15 @@ def _rank(
     return sorted((e for e in ended if e is not None), key=lambda e: -e.score), every
 
 
-def _promising(screen: Screen, begun: Sequence[Begun]) -> list[Begun]:
-    """The best ones, and the best places of every effect: some explain little before their last steps."""
+def _promising(screen: Screen, ranked: Sequence[int]) -> list[int]:
+    """Ranks that go on: the best ones, and the best places of every effect. Some explain little at first."""
     places: dict[str, int] = {}
     found = []
-    for rank, each in enumerate(begun):
-        name = screen.pairs[each.candidate.effects[0]][0].name
+    for rank, k in enumerate(ranked):
+        name = screen.pairs[k][0].name
         places[name] = places.get(name, 0) + 1
         if rank < RACED or places[name] <= PLACES:
-            found.append(each)
+            found.append(rank)
     return found
 
 
@@ -530,7 +545,7 @@ def _finish(
                 break
     work.done |= {entry.candidate: entry for entry in entries}
     if ahead is not None and entries:
-        _look_ahead(bench, none, entries, ahead)
+        _look_ahead(bench, none, [e for e in entries if may_be_named(e, entries, none, thresholds)], ahead)
     return entries
 
 
@@ -567,6 +582,23 @@ def _enter(work: _Work, candidate: Candidate, fit: Fit, known: Float[np.ndarray,
     recalls = any(getattr(bench.pairs[k][0], "recalls", False) for k in candidate.effects)
     judged = work.remembered if recalls else None
     misfit = judge_misfit(misfit_key, fit.misses, fit.along_states, np.asarray(measured), known, judged)
+    share, seats = _log_share(bench, candidate, fit), bench.seats(candidate)
+    return Entry(candidate, bench.names(candidate), fit, scores, misfit, log_share=share, seats=seats)
+
+
+def _log_share(bench: Bench, candidate: Candidate, fit: Fit) -> float:
+    """Log of the share of its prior that a candidate's numbers are found in, or those of the law without one of them.
+
+    A term whose sign is open and that is absent, a spring's cubic part for instance, is no coincidence: for the law
+    that has no such term the evidence is larger by the ratio of posterior to prior density at 0.
+
+    Source: Dickey 1971
+    """
     z, precision = np.asarray(fit.z), np.asarray(fit.precision)
-    share = float(-0.5 * z @ z - 0.5 * np.linalg.slogdet(precision)[1])
-    return Entry(candidate, bench.names(candidate), fit, scores, misfit, log_share=share, seats=bench.seats(candidate))
+    variance, simpler = np.diagonal(np.linalg.inv(precision)), [0.0]
+    for k, i in enumerate(bench.columns(candidate), bench.d):
+        parameter = bench.parameters[i]
+        if parameter.low < 0.0 == parameter.neutral < parameter.high:
+            zero = float(bench.each[i].standard(0.0))
+            simpler.append(0.5 * (zero**2 - (z[k] - zero) ** 2 / variance[k] - np.log(variance[k])))
+    return float(max(simpler) - 0.5 * z @ z - 0.5 * np.linalg.slogdet(precision)[1])

@@ -39,8 +39,6 @@ LASTING = 8
 """Further steps of those that went on."""
 LEAST_SHARE = 0.2
 """Of the numbers measured, that noise is taken to have in the residuals however many are fitted."""
-GLANCING = 6
-"""Steps of the solver from each of a few points, by which partners of a known effect are ranked."""
 STRAYED = 1.5
 """Of θ's z: where the simulator without an effect was driven further out, a candidate also begins from the middle."""
 DRAWS, ASIDE = 4, 0.7
@@ -272,21 +270,27 @@ class Screen:
         """The candidate's own numbers where it was fitted best."""
         return np.asarray(begun.ends[0][0])[self.d : self.d + self.scene.count(begun.candidate)]
 
-    def glance(self, candidate: Candidate, known: Screened, alone: Float[np.ndarray, " e"] | None = None) -> float:
-        """The cost of a candidate after a few steps from a fit of a part of it.
+    def beside(
+        self, candidate: Candidate, known: Screened, alone: Float[np.ndarray, " e"] | None = None
+    ) -> list[tuple[Any, Array]]:
+        """Points (p, δ) of a candidate beside a fit of a part of it.
 
         What is added begins nearly neutral, as usual, or as it was fitted `alone`.
         """
-        self.scene.begin_around(known.candidate, known.p)
         added = Candidate(tuple(k for k in candidate.effects if k not in known.candidate.effects))
-        costs = []
         begin, weak = self._begin(added), self._begin(added, NEAR)
         points = [weak, begin] if np.abs(begin - weak).max(initial=0.0) > 0.0 else [begin]
-        for start in [*points, *([alone] if alone is not None else [])]:
-            p = self._put(added, known, start)
-            found = self.fit(candidate, p, known.delta, known.sigma, GLANCING)
-            costs.append(np.inf if found[2] is None else float(found[2].cost))
-        return min(costs)
+        starts = [*points, *([alone] if alone is not None else [])]
+        return [(self._put(added, known, start), known.delta) for start in starts]
+
+    def glance(
+        self, candidate: Candidate, known: Screened, ends: Sequence[tuple[Any, Array]], steps: int
+    ) -> list[tuple[float, Any, Array]]:
+        """Cost, p and δ after a few steps from points beside what is known, the best first."""
+        self.scene.begin_around(known.candidate, known.p)
+        tried = [self.fit(candidate, p, delta, known.sigma, steps) for p, delta in ends]
+        found = [(float(curvature.cost), p, delta) for p, delta, curvature, _ in tried if curvature is not None]
+        return sorted(found, key=lambda item: item[0])
 
     def _begin(self, candidate: Candidate, share: float = 1.0) -> Float[np.ndarray, " e"]:
         """A candidate's x where a fit begins."""

@@ -24,6 +24,7 @@ __all__ = [
     "explains",
     "has_special_case",
     "is_worth",
+    "may_be_named",
     "share_left",
 ]
 
@@ -89,7 +90,10 @@ class Entry:
     """Log predictive density of every window, its initial state profiled out."""
     misfit: Misfit
     ahead: float = float("nan")
-    """Share of the baseline's error that predictions as long as the horizon still have beyond the noise, if known."""
+    """Share of the baseline's error that predictions as long as the horizon still have beyond the noise.
+
+    Known of candidates that may be named.
+    """
     log_share: float = 0.0
     """Log of the share of its prior that the candidate's numbers are found in: the evidence over the best likelihood.
 
@@ -195,6 +199,12 @@ def decide(
     result.probabilities = _weigh(result, group, thresholds.least / _resolution(entries[0], none, thresholds))
     result.verdict = "explained" if len(sets) == 1 else "ambiguous"
     return result
+
+
+def may_be_named(entry: Entry, entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:
+    """Whether a candidate ties for the best of `entries`, which comes first, or is a part of one that does."""
+    tied = (other for other in entries if _ties(other, entries[0], none, thresholds))
+    return any(set(entry.names) <= set(other.names) for other in tied)
 
 
 def explains(entry: Entry, none: Entry, thresholds: Thresholds) -> bool:

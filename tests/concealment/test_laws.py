@@ -142,6 +142,7 @@ def test_a_delay_shifts_the_command_and_a_drop_comes_in_its_time():
     assert drop.command(Still, 2.0) == 2.0
     Still.time = drop.time + 1e-6
     assert drop.command(Still, 2.0) == pytest.approx(2.0 * drop.gain)
+    assert 0.0 < drop.gain < 2.0
 
 
 def test_readings_are_late_scaled_and_shifted():

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bayessim_jax.diagnosis.bench import Candidate
-from bayessim_jax.diagnosis.procedure import Problem, _folds, _with_numbers_of, detect
+from bayessim_jax.diagnosis.bench import Candidate, margin_of_effect
+from bayessim_jax.diagnosis.procedure import Problem, _folds, _log_share, _with_numbers_of, detect
 from bayessim_jax.diagnosis.response import Motion
-from bayessim_jax.effects import EFFECTS, Scales
+from bayessim_jax.effects import EFFECTS, EffectParameter, Scales
 from bayessim_jax.inference.direct import estimate_noise
 from bayessim_jax.inference.replay import replay_window
 from bayessim_jax.inference.shooting import normal_equations, predict_all, solve
@@ -215,3 +215,14 @@ def test_a_special_case_begins_with_the_numbers_of_what_contains_it(problem):
     assert bench.values(special, begun)["coulomb_friction@joint/hinge/coulomb"] == pytest.approx(level)
     same = [bench.replay(candidate, x, bench.shots) for candidate, x in ((general, z), (special, begun))]
     np.testing.assert_allclose(*same, atol=1e-12)
+
+
+@pytest.mark.parametrize(("z", "low", "share"), [(0.0, -1.0, 0.0), (1.0, -1.0, -5.105), (0.3, 0.01, -4.65)])
+def test_a_term_that_is_absent_is_no_coincidence(z, low, share):
+    """A number at 0, one that is not, and one whose range ends near 0: precision 10⁴, so that ½ log 10⁴ = 4.605."""
+    parameter = EffectParameter("cubic", "", low, 1.0, 0.0, 0.5)
+    bench = SimpleNamespace(
+        d=0, parameters=[parameter], each=[margin_of_effect(parameter)], columns=lambda candidate: [0]
+    )
+    fit = SimpleNamespace(z=np.array([z]), precision=np.array([[1e4]]))
+    assert _log_share(bench, Candidate((0,)), fit) == pytest.approx(share, abs=1e-3)

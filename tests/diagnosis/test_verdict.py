@@ -5,7 +5,7 @@ import pytest
 
 from bayessim_jax.diagnosis.bench import Candidate
 from bayessim_jax.diagnosis.procedure import _is_too_narrow
-from bayessim_jax.diagnosis.verdict import Entry, Thresholds, are_kin, decide, error_left
+from bayessim_jax.diagnosis.verdict import Entry, Thresholds, are_kin, decide, error_left, may_be_named
 from bayessim_jax.diagnosis.whiteness import Misfit
 from bayessim_jax.inference.shooting import Shots
 
@@ -159,3 +159,11 @@ def test_a_set_is_widened_only_where_it_is_worth_its_effects_and_is_not_enough()
     assert not _is_too_narrow([alone, pair], none, Thresholds())
     most = entry(["a@x", "b@x", "c@x", "d@x"], 300.0, 0.2, seed=3)
     assert not _is_too_narrow([most, alone], none, Thresholds())
+
+
+def test_what_ties_for_the_best_or_is_a_part_of_that_may_be_named():
+    best, second = entry(["a@x", "b@x"], 100.0, 0.002), entry(["c@x"], 99.0, 0.002, seed=1)
+    part, other = entry(["b@x"], 60.0, 0.002), entry(["d@x"], 70.0, 0.002)
+    every = [best, second, other, part]
+    asked = [may_be_named(each, every, entry([], 0.0, 1.0), Thresholds()) for each in every]
+    assert asked == [True, True, False, True]
