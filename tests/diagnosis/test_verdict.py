@@ -162,7 +162,7 @@ def test_a_set_is_widened_only_where_it_is_worth_its_effects_and_is_not_enough()
 
 
 def test_what_ties_for_the_best_or_is_a_part_of_that_may_be_named():
-    best, second = entry(["a@x", "b@x"], 100.0, 0.002), entry(["c@x"], 99.0, 0.002, seed=1)
+    best, second = entry(["a@x", "b@x"], 100.1, 0.002), entry(["c@x"], 100.0, 0.002, seed=1)
     part, other = entry(["b@x"], 60.0, 0.002), entry(["d@x"], 70.0, 0.002)
     every = [best, second, other, part]
     asked = [may_be_named(each, every, entry([], 0.0, 1.0), Thresholds()) for each in every]
