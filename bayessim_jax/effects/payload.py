@@ -34,7 +34,7 @@ class Payload(ModelEffect):
         """M and x."""
         mass, length = scales.mass, scales.length
         return (
-            EffectParameter("mass", "kg", 0.0, 3.0 * mass, 0.0, 0.05 * mass),
+            EffectParameter("mass", "kg", 0.001 * mass, 20.0 * mass, 0.0, 0.05 * mass, log=True),
             EffectParameter("position", "m", 0.0, 2.0 * length, length, length),
         )
 
