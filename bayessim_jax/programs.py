@@ -64,7 +64,7 @@ def trace_once(
 ) -> Any:
     """`jax.jit` of a function whose trace is kept where `keep_traces_in` says. It returns arrays in tuples or lists.
 
-    With `to_numpy` it returns NumPy's: for what is put together on the host, at a tenth of the cost of a call.
+    With `to_numpy` it returns NumPy's, for what is put together on the host.
     """
     if function is None:
         return functools.partial(
