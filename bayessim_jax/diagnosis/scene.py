@@ -56,6 +56,8 @@ MOVED = 0.15
 """How far θ's z and parameters of effects on the model may move before it is found anew where the steps lead."""
 HOMES = 8
 """Points around which the steps were linearized that are kept."""
+NOISES = 3
+"""Of each of them the last ones for which the response is kept over σ."""
 FEW = 3
 """Parameters of most candidates: programs with room for no more are as many times faster."""
 
@@ -150,10 +152,12 @@ class Scene(CandidatesOf):
 
     def _weigh(self, around: _Around, sigma: Array) -> Rest:
         """How readings over σ move with θ's z and initial states."""
-        key = np.asarray(sigma).tobytes()
-        if key not in around.weighed:
-            around.weighed[key] = weigh(around.shared, around.windowed, sigma)
-        return around.weighed[key]
+        key, kept = np.asarray(sigma).tobytes(), around.weighed
+        found = kept.pop(key, None)
+        kept[key] = found if found is not None else weigh(around.shared, around.windowed, sigma)
+        if len(kept) > NOISES:
+            del kept[next(iter(kept))]
+        return kept[key]
 
     def _force(self, candidate: Candidate, p: Float[np.ndarray, " k"]) -> tuple[_Around, Forcing, np.ndarray]:
         """What a candidate exerts and distorts, and how far p is from where the steps were found."""
