@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -223,7 +223,8 @@ def name_effects(
         if pairs:
             alone = {k for pair in pairs for k in pair.candidate.effects}
             best = {k for entry in entries[:2] for k in entry.candidate.effects}
-            kept = [*pairs, *(found for found in ranked if found.candidate.effects[0] in alone | best)]
+            singly = [found for found in ranked if found.candidate.effects[0] in alone | best]
+            kept = [*pairs, *singly, *growth.parts(pairs[0], {found.candidate for found in singly})]
             entries = finish(kept)
             while entries and _is_too_narrow(entries, none, thresholds):
                 leads = [_settled(screen, entry, kept) for entry in _widest(work.bench, none, entries)]
@@ -299,6 +300,13 @@ class _Growth:
             return screen.finish_candidate(raced, beside) if raced is not None else None
 
         return [each for each in _each(self.screens, [*grown, *split], finish) if each is not None]
+
+    def parts(self, known: Screened, but: Collection[Candidate]) -> list[Screened]:
+        """Every effect of a set by itself, from its numbers there: beside another one it may be found by chance."""
+        first = self.screens[0]
+        parts = [first.part(known, (k,)) for k in known.candidate.effects]
+        ended = [first.settle(p.candidate, p.p, p.delta, p.sigma) for p in parts if p.candidate not in but]
+        return [each for each in ended if each is not None]
 
     def _glance(
         self, known: Screened, ends: Mapping[Candidate, Sequence[tuple[Any, Array]]], steps: int
@@ -490,8 +498,8 @@ def _finish(
 
     The best of those with many parameters that leave more than `remain` says of the motion are fitted from their usual
     values, too: where joints stick and slip, what fits there may be far from what fits in simulation. Rivals of the
-    best are fitted from its numbers, and where one of them is then the best, rivals from its own: none must win by a
-    better start. What was fitted before is taken as it was.
+    best and parts of it are fitted from its numbers, and where one of them is then the best, rivals from its own: none
+    must win by a better start. What was fitted before is taken as it was.
     """
     bench, before = work.bench, dict(work.done)
     work.say(f"simulating {sum(c.candidate not in before for c in candidates)} candidates; compiling takes a while")
@@ -540,6 +548,7 @@ def _finish(
         for _ in range(TURNS if entries else 0):
             best = entries[0]
             rivals = [entry for entry in entries if _are_rivals(entry, best, none, thresholds)][:AGAIN]
+            rivals += [entry for entry in entries if set(entry.names) < set(best.names)]
             _replace(work, entries, zip(rivals, pool.map(partial(from_numbers_of, best), rivals), strict=True))
             if entries[0] is best:
                 break

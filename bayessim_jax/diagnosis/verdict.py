@@ -59,6 +59,8 @@ class Thresholds:
     """Share of the baseline's error of predictions ahead that an explanation of the misfit may leave."""
     both: float = 0.001
     """The one share times the other: what leaves something of both has found something else."""
+    most: float = 0.1
+    """The same product, above which an effect explains nothing, though no misfit of pieces can be detected."""
     foreseen: float = 0.003
     """Share of the baseline's error of predictions ahead, below which what pieces leave is the sensors' own."""
     enough: float = 0.015
@@ -214,9 +216,9 @@ def explains(entry: Entry, none: Entry, thresholds: Thresholds) -> bool:
     not judged where its past is unknown is excused there already, and has to explain the pieces that are judged.
     """
     foreseen = entry.ahead <= thresholds.foreseen and bool(entry.misfit.judged.all())
-    if entry.misfit.p_value >= FALSE_ALARMS or foreseen:
-        return True
     left = share_left(entry.misfit, none.misfit)
+    if foreseen or (entry.misfit.p_value >= FALSE_ALARMS and not left * entry.ahead > thresholds.most):
+        return True
     return left <= thresholds.left and not (entry.ahead > thresholds.ahead or left * entry.ahead > thresholds.both)
 
 

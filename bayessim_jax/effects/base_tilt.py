@@ -11,6 +11,9 @@ from bayessim_jax.effects.places import detail
 
 __all__ = ["BaseTilt"]
 
+WIDEST = 1.5
+"""rad: a base that hangs on a wall is a model of its own."""
+
 
 class BaseTilt(ModelEffect):
     """g ↦ R g: gravity turned by an angle about the hinge of a plane mechanism, or by two angles across gravity.
@@ -27,7 +30,7 @@ class BaseTilt(ModelEffect):
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """One angle, or two."""
         names = ("angle",) if detail(place) else ("angle", "second_angle")
-        return tuple(EffectParameter(name, "rad", -0.5, 0.5, 0.0, 0.02) for name in names)
+        return tuple(EffectParameter(name, "rad", -WIDEST, WIDEST, 0.0, 0.02) for name in names)
 
     def targets(self, model: mujoco.MjModel, place: str) -> tuple[tuple[str, tuple[int, ...]], ...]:
         """The components of gravity that change."""

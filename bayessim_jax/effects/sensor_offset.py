@@ -10,6 +10,9 @@ from bayessim_jax.effects.places import encoders
 
 __all__ = ["SensorOffset"]
 
+TURN = 1.5
+"""rad: as far as a base may be tilted, which in a plane is the same."""
+
 
 class SensorOffset(SenseEffect):
     """q ↦ q + q₀, in the unit of the channel."""
@@ -23,7 +26,8 @@ class SensorOffset(SenseEffect):
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The offset q₀."""
         reach = scales.position
-        return (EffectParameter("offset", scales.unit, -0.5 * reach, 0.5 * reach, 0.0, 0.03 * reach, scan=4),)
+        most = max(0.5 * reach, TURN) if scales.unit == "rad" else 0.5 * reach
+        return (EffectParameter("offset", scales.unit, -most, most, 0.0, 0.03 * reach, scan=4),)
 
     def sense(self, values: Values, memory: Memory, reading: Scalar, moment: Moment) -> Scalar:
         """The sum q + q₀."""

@@ -18,9 +18,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from bayessim_jax.beliefs.margins import Margins, normal
 from bayessim_jax.diagnosis.whiteness import difference_noise
@@ -39,7 +40,7 @@ from bayessim_jax.recordings.shots import (
 )
 from bayessim_jax.recordings.windows import Windows
 
-__all__ = ["Settled", "settle_step"]
+__all__ = ["Settled", "ratio_of_motion", "settle_step"]
 
 TOLERABLE = 1.0
 """Of the noise: with a larger error of the time step the finer simulation is the one that is used."""
@@ -47,6 +48,12 @@ INVISIBLE = 0.2
 """Of the noise of an average over all rows: a smaller error changes no posterior."""
 SURE = 0.25
 """Of s that is uncertain at least, for what interpolation does not hold."""
+CONTRARY = 3.0
+"""Standard deviations by which a fitted s may differ from the one that positions and velocities tell."""
+BLUR = 0.05
+"""Of s as they tell it: standard deviation for what trapezoids leave of an integral."""
+PIECE, FEWEST = 0.15, 30
+"""s over which positions and velocities are compared, and so many pieces at least."""
 RATIO = normal(1 / 3, 1 / 3)
 """What is believed of s."""
 
@@ -96,7 +103,8 @@ def settle_step(
     """Fit a case and the time step of what was recorded, with a finer simulation where the model's is too coarse.
 
     The finer simulation is used where the error is not small against the sensors' noise, unless the recordings are
-    explained less well by it, or derivatives are differences: these cost too much of it.
+    explained less well by it, or derivatives are differences: these cost too much of it. A fit may take s for physics
+    that are missing; where positions and velocities themselves contradict it, they are believed (`ratio_of_motion`).
     """
     margins = model.margins + Margins.create(["time step"], [RATIO])
     shots = model.shots(windows)
@@ -114,12 +122,17 @@ def settle_step(
     if size * np.sqrt(counts) < INVISIBLE:
         return Settled(model, fit, predict, first, margins, SURE * limit)
 
+    moved = ratio_of_motion(model, windows)
+
     def refit(base: CaseModel, predict: Predict, error: StepError, runs: np.ndarray) -> Settled:
         calm = tame(runs, shots)
         seen = _with_runs(shots, calm)
         found = fit_direct(key, predict, seen, margins.size, start=fit, step=base.step, say=say)
-        ratio = float(np.clip(RATIO.value(found.z[-1]), 0.0, 1.0))
+        ratio = float(RATIO.value(found.z[-1]))
         sd = RATIO.b * float(np.sqrt(np.linalg.inv(np.asarray(found.precision))[-1, -1]))
+        if abs(ratio - moved[0]) > CONTRARY * np.hypot(sd, moved[1]):
+            ratio, sd = moved
+        ratio = float(np.clip(ratio, 0.0, 1.0))
         ahead, behind = (interpolate(error.nodes, ratio + step, calm) for step in (1e-3, -1e-3))
         wild = (calm == 0.0).all(1) * np.abs(runs).max(1)
         base = dataclasses.replace(base, step_error=dataclasses.replace(error, z=found.z[:-1], ratio=ratio))
@@ -137,6 +150,68 @@ def settle_step(
             told = dataclasses.replace(again.model, remarks=(*again.model.remarks, remark))
             return dataclasses.replace(again, model=told)
     return refit(model, predict, error, runs)
+
+
+def ratio_of_motion(model: CaseModel, windows: Windows) -> tuple[float, float]:
+    """Mean and standard deviation of s as positions and velocities tell it, whatever moves the machine.
+
+    Semi-implicit Euler adds to a position its velocity at the end of each step: over a piece of a recording
+
+        Δq − ∫ v dt = s h/2 Δv
+
+    with the integral by trapezoids. A regression of the left side on Δv, and on Δq for scales that are off, together
+    with `RATIO`; that alone where joints' velocities are not measured, or are late by more than a step could do, or
+    where the integrator is another one.
+    """
+    m = model.compiled
+    found: list[tuple[float, float]] = [(RATIO.a, RATIO.b)]
+    if m.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
+        for _, q, v in model.case.layout.single:
+            there = windows.qpos_measured[:, :, q] & windows.qvel_measured[:, :, v]
+            leads = _lead(windows.time, windows.qpos[:, :, q], windows.qvel[:, :, v], there)
+            told = ((2.0 * lead / m.opt.timestep, np.hypot(2.0 * sd / m.opt.timestep, BLUR)) for lead, sd in leads)
+            found += [(s, sd) for s, sd in told if -CONTRARY * sd < s < 1.0 + CONTRARY * sd]
+    weights = np.array([1.0 / sd**2 for _, sd in found])
+    return float(weights @ [mean for mean, _ in found] / weights.sum()), float(weights.sum() ** -0.5)
+
+
+def _lead(
+    time: Float[np.ndarray, "windows rows"],
+    q: Float[np.ndarray, "windows rows"],
+    v: Float[np.ndarray, "windows rows"],
+    there: Bool[np.ndarray, "windows rows"],
+) -> list[tuple[float, float]]:
+    """By how many seconds of its own motion a joint's position is ahead, with a standard deviation, if that is told.
+
+    The noise of Δv makes a slope smaller; it is known from second differences. Pieces that lie far off, such as those
+    of an impact between two rows, are left out.
+    """
+    steps = np.diff(time, axis=1)
+    passed = np.cumsum(0.5 * (v[:, 1:] + v[:, :-1]) * steps, axis=1)
+    travel = np.concatenate([np.zeros((len(v), 1)), passed], axis=1)
+    rows = max(round(PIECE / float(np.median(steps[steps > 0]))), 2) if (steps > 0).any() else time.shape[1]
+    first = np.arange(0, time.shape[1] - rows, rows)
+    if not first.size:
+        return []
+    whole = np.all(np.lib.stride_tricks.sliding_window_view(there, rows + 1, axis=1), axis=-1)[:, first]
+    if whole.sum() < FEWEST:
+        return []
+    dq, dv, moved = ((x[:, first + rows] - x[:, first])[whole] for x in (q, v, travel))
+    bends = np.abs(v[:, 2:] - 2 * v[:, 1:-1] + v[:, :-2])[there[:, 2:] & there[:, 1:-1] & there[:, :-2]]
+    noise = 2.0 * (np.median(bends) / 0.6745) ** 2 / 6.0
+    columns, ahead = np.stack([dv, dq, np.ones_like(dv)], axis=1), dq - moved
+    kept = np.ones(len(dv), bool)
+    for _ in range(3):
+        slopes = np.linalg.lstsq(columns[kept], ahead[kept], rcond=None)[0]
+        left = ahead - columns @ slopes
+        kept = np.abs(left) <= 4.0 * np.median(np.abs(left)) / 0.6745
+    beside = columns[kept, 1:]
+    alone = dv[kept] - beside @ np.linalg.lstsq(beside, dv[kept], rcond=None)[0]
+    size = float(alone @ alone) - noise * kept.sum()
+    if size < 2.0 * noise * kept.sum() or size <= 0.0:
+        return []
+    sd = float(np.sqrt((left[kept] ** 2).sum() / (kept.sum() - 3) * (alone @ alone))) / size
+    return [(float(alone @ ahead[kept]) / size, sd)]
 
 
 def _with_runs(shots: Shots, runs: Float[np.ndarray, "windows nodes rows obs"]) -> Shots:

@@ -86,6 +86,13 @@ def test_what_explains_pieces_and_predicts_no_better_explains_nothing():
         assert verdict(rough).verdict == wanted
 
 
+def test_what_leaves_most_of_both_explains_nothing_though_pieces_cannot_tell():
+    weak = entry(["a@x"], 10.0, 0.6, p=0.3)
+    for ahead, wanted in ((0.9, "unexplained"), (0.1, "explained"), (float("nan"), "explained")):
+        weak.ahead = ahead
+        assert verdict(weak).verdict == wanted
+
+
 def test_what_is_excused_where_its_past_is_unknown_has_to_explain_what_is_judged():
     """A jolt, taken for bristles: they leave a third of the misfit in pieces; the moves of initial states hide it."""
     for left, wanted in ((0.3, "unexplained"), (0.002, "explained")):

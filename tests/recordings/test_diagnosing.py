@@ -120,6 +120,23 @@ def test_two_effects_that_hide_each_other_are_both_named(folder):
 
 
 @pytest.mark.slow
+def test_what_is_found_beside_another_effect_is_tried_by_itself(folder):
+    """A drop by itself is fitted at another time; beside a drift that is hardly there it is found where it is."""
+    make_case(folder / "drop", "slide", "gain_drop", strength=0.516, noise=3.0, finer=4, seed=5300040)
+    assert main(["diagnose", str(folder / "drop"), "--out", str(folder / "drop-run"), "--quiet"]) == 0
+    table = json.loads((folder / "drop-run" / "diagnosis.json").read_text())
+    assert [e["effect"] for e in table["effects"]] == ["gain_drop"]
+
+
+@pytest.mark.slow
+def test_a_tilt_is_the_same_as_an_offset_however_large(folder):
+    make_case(folder / "tilt", "swing", "base_tilt", strength=0.5, noise=0.3, quantize=2048, finer=4, seed=5300049)
+    assert main(["diagnose", str(folder / "tilt"), "--out", str(folder / "tilt-run"), "--quiet"]) == 0
+    table = json.loads((folder / "tilt-run" / "diagnosis.json").read_text())
+    assert sorted(names[0].partition("@")[0] for names in table["confusion_set"]) == ["base_tilt", "sensor_offset"]
+
+
+@pytest.mark.slow
 def test_a_limit_that_is_always_behind_its_command_is_named(folder):
     """Its memory is longer than any window, and without it θ is driven to the edge of its prior."""
     make_case(folder / "late", "slide", "actuator_rate_limit", strength=0.5, seed=16)

@@ -10,7 +10,7 @@ import pytest
 from bayessim_jax.inference.direct import fit_direct
 from bayessim_jax.recordings.loading import load_case
 from bayessim_jax.recordings.shots import StepError, case_model, lagrange, predictor, split_windows
-from bayessim_jax.recordings.stepping import RATIO, settle_step
+from bayessim_jax.recordings.stepping import RATIO, ratio_of_motion, settle_step
 from benchmarks.worlds import STEP, make_case
 
 
@@ -83,6 +83,33 @@ def test_the_step_of_what_was_recorded_is_found_and_does_not_bend_parameters(tmp
     assert (np.abs(np.asarray(settled.fit.z[:-1]) - truth) < 4 * sd[:-1]).all()
     plain = fit_direct(jax.random.key(0), predictor(model), model.shots(windows), 2)
     assert (np.abs(np.asarray(plain.z) - truth) > 8 * sd[:-1]).any()
+
+
+@pytest.mark.parametrize("rig", ["slide", "double"])
+@pytest.mark.parametrize("finer", [0.25, 1.0, 16.0])
+def test_positions_and_velocities_tell_the_step_whatever_moves_the_machine(tmp_path, rig, finer):
+    settings = {"strength": 0.3, "recordings": 4, "seconds": 3.0, "rate": 125.0, "seed": 2}
+    make_case(tmp_path / "case", rig, "viscous_friction", finer=finer, **settings)
+    model = case_model(load_case(tmp_path / "case").check())
+    s, sd = ratio_of_motion(model, split_windows(model)[0])
+    assert sd < 0.2
+    assert s == pytest.approx(0.25 / finer, abs=2.5 * sd)
+
+
+def test_without_velocities_the_step_is_what_is_believed_of_any(tmp_path):
+    make_case(tmp_path / "case", "slide", noise=1.0, recordings=2, seconds=2.0, velocities=False)
+    model = case_model(load_case(tmp_path / "case").check())
+    assert ratio_of_motion(model, split_windows(model)[0]) == pytest.approx((RATIO.a, RATIO.b))
+
+
+def test_missing_physics_are_not_taken_for_a_step(tmp_path):
+    """Fitted, s would be six: a viscous friction that the simulator lacks."""
+    sealed = {"strength": 0.072, "noise": 3.0, "finer": 4, "seed": 5300029}
+    make_case(tmp_path / "case", "slide", "viscous_friction", **sealed)
+    model = case_model(load_case(tmp_path / "case").check())
+    settled = settle_step(jax.random.key(0), model, split_windows(model)[0])
+    assert float(RATIO.value(settled.fit.z[-1])) > 2.0
+    assert settled.model.step_error.ratio < 0.6
 
 
 def test_the_fit_of_some_parameters_is_the_margin_of_that_of_all(tmp_path):
