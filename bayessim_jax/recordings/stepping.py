@@ -48,8 +48,8 @@ INVISIBLE = 0.2
 """Of the noise of an average over all rows: a smaller error changes no posterior."""
 SURE = 0.25
 """Of s that is uncertain at least, for what interpolation does not hold."""
-CONTRARY = 3.0
-"""Standard deviations by which a fitted s may differ from the one that positions and velocities tell."""
+BEYOND = 3.0
+"""Standard deviations by which s may be found below 0 or above 1, or longer than positions and velocities tell."""
 BLUR = 0.05
 """Of s as they tell it: standard deviation for what trapezoids leave of an integral."""
 PIECE, FEWEST = 0.15, 30
@@ -104,7 +104,9 @@ def settle_step(
 
     The finer simulation is used where the error is not small against the sensors' noise, unless the recordings are
     explained less well by it, or derivatives are differences: these cost too much of it. A fit may take s for physics
-    that are missing; where positions and velocities themselves contradict it, they are believed (`ratio_of_motion`).
+    that are missing; where it finds no step that there could be, or positions and velocities tell of a shorter one,
+    these are believed (`ratio_of_motion`). What they tell may be too long: velocities are often late themselves, by the
+    filter that they come from.
     """
     margins = model.margins + Margins.create(["time step"], [RATIO])
     shots = model.shots(windows)
@@ -130,7 +132,8 @@ def settle_step(
         found = fit_direct(key, predict, seen, margins.size, start=fit, step=base.step, say=say)
         ratio = float(RATIO.value(found.z[-1]))
         sd = RATIO.b * float(np.sqrt(np.linalg.inv(np.asarray(found.precision))[-1, -1]))
-        if abs(ratio - moved[0]) > CONTRARY * np.hypot(sd, moved[1]):
+        less = moved[0] < ratio - BEYOND * np.hypot(sd, moved[1])
+        if less or not -BEYOND * sd <= ratio <= 1.0 + BEYOND * sd:
             ratio, sd = moved
         ratio = float(np.clip(ratio, 0.0, 1.0))
         ahead, behind = (interpolate(error.nodes, ratio + step, calm) for step in (1e-3, -1e-3))
@@ -170,7 +173,7 @@ def ratio_of_motion(model: CaseModel, windows: Windows) -> tuple[float, float]:
             there = windows.qpos_measured[:, :, q] & windows.qvel_measured[:, :, v]
             leads = _lead(windows.time, windows.qpos[:, :, q], windows.qvel[:, :, v], there)
             told = ((2.0 * lead / m.opt.timestep, np.hypot(2.0 * sd / m.opt.timestep, BLUR)) for lead, sd in leads)
-            found += [(s, sd) for s, sd in told if -CONTRARY * sd < s < 1.0 + CONTRARY * sd]
+            found += [(s, sd) for s, sd in told if -BEYOND * sd < s < 1.0 + BEYOND * sd]
     weights = np.array([1.0 / sd**2 for _, sd in found])
     return float(weights @ [mean for mean, _ in found] / weights.sum()), float(weights.sum() ** -0.5)
 
