@@ -53,6 +53,8 @@ NUMBERS = 15_000
 """What was measured in these windows, from where on fewer will do."""
 FINALISTS, LEADERS, PAIRS = 7, 2, 4
 """Single effects that are simulated at most, at least, and pairs."""
+NEAR, ALIKE, VARIED = 0.75, 2, 2
+"""Share of the best pair's gain from which pairs with other effects are simulated, so many with each, and in all."""
 RACED, PLACES = 40, 2
 """Candidates, and places of each effect, that go on after their first steps along the motion."""
 FINISHED = 14
@@ -76,6 +78,8 @@ KIN = 2
 """Relatives of the best pair's members, of which partners are looked for as well."""
 WORTH = 0.5
 """Share of the best effect's gain from which another is simulated."""
+EDGE = 3.0
+"""Standard deviations of a parameter's prior, as a normal variable, from where on it is driven there."""
 DOUBT = 0.05
 """Probability that a model fails in a window, where the simulator without effects then predicts."""
 WORKERS = 2
@@ -215,11 +219,13 @@ def name_effects(
     explained = bool(entries) and explains(entries[0], none, thresholds)
     # where nothing is predicted ahead, what shows in the windows themselves is all that tells of another effect
     shows = explained and problem.ahead is None and entries[0].misfit.p_value < FALSE_ALARMS
-    if left > thresholds.enough or not explained or shows or entries[0].ahead > thresholds.doubtful:
+    doubtful = explained and (entries[0].ahead > thresholds.doubtful or _is_cornered(entries[0], screen.d))
+    if left > thresholds.enough or not explained or shows or doubtful:
         say("one effect is not enough: trying pairs")
         worth = thresholds.worth * remain(ranked[0]) if explained else np.inf
         growth = _Growth(screens, begun)
-        pairs = [pair for pair in _pair(key, growth, nothing, ranked)[:PAIRS] if remain(pair) < worth]
+        found = _pair(key, growth, nothing, ranked)
+        pairs = [pair for pair in _varied(found, nothing.score) if remain(pair) < worth]
         if pairs:
             alone = {k for pair in pairs for k in pair.candidate.effects}
             best = {k for entry in entries[:2] for k in entry.candidate.effects}
@@ -237,6 +243,11 @@ def name_effects(
                 kept = [*wider, *kept]
                 entries = finish(kept)
     return decide(work.bench, none, entries, work.group, thresholds, listed)
+
+
+def _is_cornered(entry: Entry, d: int) -> bool:
+    """Whether a candidate drives a parameter to the edge of its prior, and leaves something that shows."""
+    return entry.misfit.p_value < FALSE_ALARMS and bool((np.abs(np.asarray(entry.fit.z)[:d]) > EDGE).any())
 
 
 def _is_too_narrow(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:
@@ -259,7 +270,7 @@ def _widest(bench: Bench, none: Entry, entries: Sequence[Entry]) -> list[Entry]:
 
 def _settled(screen: Screen, entry: Entry, kept: Sequence[Screened]) -> Screened:
     """What was found in simulation, fitted along the motion again."""
-    known = next(found for found in kept if found.candidate == entry.candidate)
+    known = next((found for found in kept if found.candidate == entry.candidate), kept[0])
     return screen.settle(entry.candidate, entry.fit.z, known.delta, entry.fit.sigma) or known
 
 
@@ -430,6 +441,22 @@ def _pair(key: PRNGKeyArray, growth: _Growth, nothing: Screened, ranked: Sequenc
     return sorted(found, key=lambda item: -item.score)
 
 
+def _varied(ranked: Sequence[Screened], least: float) -> list[Screened]:
+    """The best pairs, and of those that come near the very best some with effects that are in none of these.
+
+    What explains most along the motion is not what explains most in simulation where several do.
+    """
+    chosen = list(ranked[:PAIRS])
+    common = {k for found in chosen for k in found.candidate.effects}
+    for found in ranked[PAIRS:]:
+        new = set(found.candidate.effects) - common
+        alike = sum(bool(new & set(other.candidate.effects)) for other in chosen)
+        near = found.score - least > NEAR * (ranked[0].score - least)
+        if new and near and alike < ALIKE and len(chosen) < PAIRS + VARIED:
+            chosen.append(found)
+    return chosen
+
+
 def _with_room(items: Sequence[T], first: int, count: Callable[[T], int], gain: Callable[[T], float]) -> list[T]:
     """The first ones, and others that come near the very first with fewer parameters: these leave room for one more."""
     leads = list(items[:first])
@@ -470,12 +497,24 @@ def _are_rivals(entry: Entry, best: Entry, none: Entry, thresholds: Thresholds) 
     return replaced and (share_left(entry.misfit, none.misfit) <= thresholds.left or has_special_case(best, entry))
 
 
-def _with_numbers_of(bench: Bench, best: Entry, other: Entry) -> Float[Array, " k"]:
+def _special_cases(bench: Bench, candidate: Candidate) -> list[Candidate]:
+    """Sets with one effect replaced by a special case of it; those of single effects are finalists anyway."""
+    if len(candidate.effects) < 2:
+        return []
+    return [
+        Candidate(tuple(sorted({*candidate.effects, k} - {effect})))
+        for effect in candidate.effects
+        for k in range(len(bench.pairs))
+        if k not in candidate.effects and contains(bench.name(effect), bench.name(k))
+    ]
+
+
+def _with_numbers_of(bench: Bench, best: Entry, other: Candidate, start: Float[Array, " k"]) -> Float[Array, " k"]:
     """Another candidate's point with the numbers of the best, as far as they have the same names."""
     found = dict(zip(bench.columns(best.candidate), np.asarray(best.fit.z)[bench.d :].tolist(), strict=False))
-    mine = bench.columns(other.candidate)
+    mine = bench.columns(other)
     replaced = {bench.parameters[i].name: bench.each[i].value(z) for i, z in found.items() if i not in mine}
-    point = np.array(other.fit.z)
+    point = np.array(start)
     point[: bench.d] = best.fit.z[: bench.d]
     for j, i in enumerate(mine):
         if i in found:
@@ -499,7 +538,8 @@ def _finish(
     The best of those with many parameters that leave more than `remain` says of the motion are fitted from their usual
     values, too: where joints stick and slip, what fits there may be far from what fits in simulation. Rivals of the
     best and parts of it are fitted from its numbers, and where one of them is then the best, rivals from its own: none
-    must win by a better start. What was fitted before is taken as it was.
+    must win by a better start. Special cases of its effects are tried in their places. What was fitted before is taken
+    as it was.
     """
     bench, before = work.bench, dict(work.done)
     work.say(f"simulating {sum(c.candidate not in before for c in candidates)} candidates; compiling takes a while")
@@ -523,7 +563,7 @@ def _finish(
         return improve(entry, bench.starts(entry.candidate, jnp.zeros(bench.d)), entry.fit.sigma)
 
     def from_numbers_of(best: Entry, entry: Entry) -> Entry:
-        return improve(entry, [_with_numbers_of(bench, best, entry)], best.fit.sigma)
+        return improve(entry, [_with_numbers_of(bench, best, entry.candidate, entry.fit.z)], best.fit.sigma)
 
     entries: list[Entry] = []
     with ThreadPoolExecutor(WORKERS) as pool:
@@ -547,6 +587,13 @@ def _finish(
         _replace(work, entries, zip(again, pool.map(from_usual, again), strict=True))
         for _ in range(TURNS if entries else 0):
             best = entries[0]
+            if best.candidate in before:
+                break
+            tried = {entry.candidate for entry in entries}
+            simpler = [s for s in _special_cases(bench, best.candidate) if s not in tried]
+            begun = [_with_numbers_of(bench, best, s, bench.starts(s, jnp.zeros(bench.d))[-1]) for s in simpler]
+            found = pool.map(lambda s, p, best=best: enter(s, p, best.fit.sigma), simpler, begun)
+            entries = sorted([*entries, *(e for e in found if e is not None)], key=lambda e: -e.score)
             rivals = [entry for entry in entries if _are_rivals(entry, best, none, thresholds)][:AGAIN]
             rivals += [entry for entry in entries if set(entry.names) < set(best.names)]
             _replace(work, entries, zip(rivals, pool.map(partial(from_numbers_of, best), rivals), strict=True))

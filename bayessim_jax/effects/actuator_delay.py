@@ -33,7 +33,9 @@ class ActuatorDelay(ActEffect):
         """The delay T."""
         high = scales.timestep * samples_back(scales.timestep)
         return (
-            EffectParameter("seconds", "s", 0.0, high, 0.0, min(0.02 + 0.37 * scales.timestep, 0.5 * high), form=0.01),
+            EffectParameter(
+                "seconds", "s", 0.0, high, 0.0, min(0.02 + 0.37 * scales.timestep, 0.5 * high), scan=4, form=0.01
+            ),
         )
 
     def begin(self, values: Values, command: Any, moment: Moment) -> Memory:

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from bayessim_jax.diagnosis.bench import Candidate, margin_of_effect
-from bayessim_jax.diagnosis.procedure import Problem, _folds, _log_share, _with_numbers_of, detect
+from bayessim_jax.diagnosis.procedure import (
+    Problem,
+    _folds,
+    _log_share,
+    _special_cases,
+    _varied,
+    _with_numbers_of,
+    detect,
+)
 from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.effects import EFFECTS, EffectParameter, Scales
 from bayessim_jax.inference.direct import estimate_noise
@@ -210,11 +218,31 @@ def test_a_special_case_begins_with_the_numbers_of_what_contains_it(problem):
         z[bench.d + j] = bench.each[column].standard(jnp.asarray(value))
     z[bench.d + 3] = -0.7  # the armature, which both have
     known = SimpleNamespace(candidate=general, fit=SimpleNamespace(z=jnp.asarray(z)))
-    other = SimpleNamespace(candidate=special, fit=SimpleNamespace(z=jnp.zeros(bench.size)))
-    begun = _with_numbers_of(bench, known, other)
+    begun = _with_numbers_of(bench, known, special, jnp.zeros(bench.size))
     assert bench.values(special, begun)["coulomb_friction@joint/hinge/coulomb"] == pytest.approx(level)
     same = [bench.replay(candidate, x, bench.shots) for candidate, x in ((general, z), (special, begun))]
     np.testing.assert_allclose(*same, atol=1e-12)
+
+
+def test_special_cases_take_the_place_of_effects_of_a_set(problem):
+    bench = problem.bench(problem.pairs)
+    assert _special_cases(bench, Candidate((1, 2))) == [Candidate((0, 2))]
+    assert _special_cases(bench, Candidate((0, 2))) == []
+    assert _special_cases(bench, Candidate((0, 1))) == [], "it is in the set already"
+    assert _special_cases(bench, Candidate((1,))) == []
+
+
+def test_pairs_that_are_simulated_differ_in_their_effects():
+    """The best four, and two of those that come near and have an effect that none of these has."""
+
+    def found(score, *effects):
+        return SimpleNamespace(candidate=Candidate(effects), score=score)
+
+    best = [found(100.0, 0, 1), found(99.0, 1, 2), found(98.0, 0, 2), found(97.0, 2, 3)]
+    others = [found(96.0, 0, 3), found(95.0, 1, 4), found(94.0, 2, 4), found(93.0, 3, 4), found(10.0, 0, 5)]
+    assert _varied([*best, *others], 0.0) == [*best, *others[1:3]]
+    assert _varied([*best, *others], 79.0) == [*best, others[1]]
+    assert _varied(best[:2], 0.0) == best[:2]
 
 
 @pytest.mark.parametrize(("z", "low", "share"), [(0.0, -1.0, 0.0), (1.0, -1.0, -5.105), (0.3, 0.01, -4.65)])
