@@ -169,9 +169,19 @@ class Bench:
         found, place = self.pairs[effect]
         return f"{found.name}@{place}"
 
-    def names(self, candidate: Candidate) -> list[str]:
-        """Of every effect of a candidate."""
-        return [self.name(k) for k in candidate.effects]
+    @property
+    def largest_shift(self) -> float:
+        """Seconds below which a shift in time is the simulator's own."""
+        return max((p.least for p in self.parameters if p.unit == "s"), default=0.0)
+
+    def told(self, candidate: Candidate, x: Float[Array, " k"]) -> list[int]:
+        """A candidate's effects without those that are no more than the time step of the simulator."""
+        found, values = [], self.values(candidate, x)
+        for k in candidate.effects:
+            own = self.parameters[self.first[k] : self.first[k + 1]]
+            if all(abs(values[f"{self.label(k)}/{p.name}"]) >= p.least for p in own):
+                found.append(k)
+        return found
 
     def seats(self, candidate: Candidate) -> dict[str, str]:
         """Names of a candidate's effects on actuators, and the same at the joint that is driven."""

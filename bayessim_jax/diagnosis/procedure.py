@@ -639,7 +639,8 @@ def _enter(work: _Work, candidate: Candidate, fit: Fit, known: Float[np.ndarray,
     judged = work.remembered if recalls else None
     misfit = judge_misfit(misfit_key, fit.misses, fit.along_states, np.asarray(measured), known, judged)
     share, seats = _log_share(bench, candidate, fit), bench.seats(candidate)
-    return Entry(candidate, bench.names(candidate), fit, scores, misfit, log_share=share, seats=seats)
+    told = bench.told(candidate, fit.z)
+    return Entry(candidate, told, [bench.name(k) for k in told], fit, scores, misfit, log_share=share, seats=seats)
 
 
 def _log_share(bench: Bench, candidate: Candidate, fit: Fit) -> float:

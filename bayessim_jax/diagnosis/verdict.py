@@ -86,7 +86,10 @@ class Entry:
     """A candidate, fitted to all windows that choose, and scored on windows that its fit did not see."""
 
     candidate: Candidate
+    told: list[int]
+    """Its effects without what is only the time step of the simulator: those that are named."""
     names: list[str]
+    """Of these."""
     fit: Fit
     scores: Float[np.ndarray, " windows"]
     """Log predictive density of every window, its initial state profiled out."""
@@ -181,7 +184,8 @@ def decide(
 
     The confusion set is what explains the misfit and predicts held-out windows as well as the best candidate; of these
     the ones with the fewest effects, of effects that contain one another the special case, and none that does so only
-    with numbers that are a coincidence where others need none: a ripple with one cycle per turn is a tilt.
+    with numbers that are a coincidence where others need none: a ripple with one cycle per turn is a tilt. Where what
+    the simulator's time step does explains the misfit alone, nothing is missing.
     """
     result = Diagnosis("unexplained", bench, none, entries, screened=screened)
     if not entries or entries[0].score - none.score < thresholds.least:
@@ -192,8 +196,12 @@ def decide(
     tied = [entry for entry in tied if explains(entry, none, thresholds) and is_worth(entry, entries, none, thresholds)]
     if not tied:
         return result
-    fewest = min(len(entry.candidate.effects) for entry in tied)
-    least = [entry for entry in tied if len(entry.candidate.effects) == fewest]
+    if any(not entry.names for entry in tied):
+        result.verdict = "no_mismatch"
+        return result
+    best = {tuple(entry.names): entry for entry in sorted(tied, key=lambda entry: entry.score)}
+    fewest = min(map(len, best))
+    least = [entry for names, entry in best.items() if len(names) == fewest]
     sets = [entry for entry in least if not any(has_special_case(entry, other) for other in least)]
     least_share = max(entry.log_share for entry in sets) - thresholds.coincidence
     sets = [entry for entry in sets if entry.log_share >= least_share]
@@ -298,5 +306,5 @@ def _weigh(result: Diagnosis, group: Int[np.ndarray, " windows"], temper: float)
 
 
 def _stands_for(chosen: Entry, other: Entry) -> bool:
-    """Whether a set is a part of another, or the other with an effect replaced by its special case."""
-    return set(chosen.names) < set(other.names) or has_special_case(other, chosen)
+    """Whether a set is a part of another or all of it, or the other with an effect replaced by its special case."""
+    return set(chosen.names) <= set(other.names) or has_special_case(other, chosen)

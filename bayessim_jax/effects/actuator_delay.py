@@ -32,11 +32,8 @@ class ActuatorDelay(ActEffect):
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The delay T."""
         high = scales.timestep * samples_back(scales.timestep)
-        return (
-            EffectParameter(
-                "seconds", "s", 0.0, high, 0.0, min(0.02 + 0.37 * scales.timestep, 0.5 * high), scan=4, form=0.01
-            ),
-        )
+        start = min(0.02 + 0.37 * scales.timestep, 0.5 * high)
+        return (EffectParameter("seconds", "s", 0.0, high, 0.0, start, scan=4, form=0.01, least=scales.shift),)
 
     def begin(self, values: Values, command: Any, moment: Moment) -> Memory:
         """The command as if it had always been the same, the latest first."""

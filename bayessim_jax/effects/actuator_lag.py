@@ -23,7 +23,8 @@ class ActuatorLag(ActEffect):
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The time constant T."""
         high = max(0.5, 20.0 * scales.period)
-        return (EffectParameter("time_constant", "s", 0.0, high, 0.0, max(0.02, scales.timestep), form=0.01),)
+        start = max(0.02, scales.timestep)
+        return (EffectParameter("time_constant", "s", 0.0, high, 0.0, start, form=0.01, least=scales.shift),)
 
     def begin(self, values: Values, command: Any, moment: Moment) -> Memory:
         """Settled."""

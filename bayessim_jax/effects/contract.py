@@ -73,6 +73,8 @@ class Scales:
     """Of a recording, s."""
     timestep: float = 0.002
     """Of the model, s."""
+    shift: float = 0.0
+    """s by which the time step of the simulator may move things in time by itself."""
     centre: float = 0.0
     """Mean position, m or rad."""
     mass: float = 1.0
@@ -130,6 +132,9 @@ class EffectParameter:
     An interval is never narrower: a friction that recordings fix to a thousandth with one smooth sign is another with
     another one.
     """
+
+    least: float = 0.0
+    """Magnitude below which it is no effect but the time step of the simulator: it is fitted, and not named."""
 
     def __post_init__(self) -> None:
         if not self.low < self.start < self.high:

@@ -35,6 +35,7 @@ def recorded_scales(
         "period": period,
         "duration": duration,
         "timestep": float(model.opt.timestep),
+        "shift": 0.0 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else float(model.opt.timestep),
         "command": _most(ctrl[:, actuators]) if actuators else 1.0,
         "friction": _contact(model, place),
     }

@@ -38,7 +38,8 @@ class SensorDelay(SenseEffect):
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The delay T."""
         high = scales.period * _count(scales.period)
-        return (EffectParameter("seconds", "s", 0.0, high, 0.0, min(0.015, 0.4 * high), form=0.01),)
+        start = min(0.015, 0.4 * high)
+        return (EffectParameter("seconds", "s", 0.0, high, 0.0, start, form=0.01, least=scales.shift),)
 
     def begin(self, values: Values, moment: Moment) -> Memory:
         """Positions and velocities of the last control periods, as with the acceleration and the jerk of now."""

@@ -136,7 +136,7 @@ class CaseDiagnosis:
     def _effects(self, entry: Entry) -> list[dict[str, Any]]:
         means, sds = moments_of_effects(self.bench, entry)
         found = []
-        for k in entry.candidate.effects:
+        for k in entry.told:
             effect, _, place = self.bench.name(k).partition("@")
             own = self.bench.parameters[self.bench.first[k] : self.bench.first[k + 1]]
             keys = [f"{self.bench.label(k)}/{p.name}" for p in own]
@@ -235,7 +235,9 @@ def _scales(model: CaseModel, places: Sequence[str]) -> dict[str, Scales]:
     if isinstance(model.system, Restarted):
         return {place: commanded_scales(plain, place, sensors, ctrl, dt, duration) for place in places}
     m = model.compiled
-    return {place: recorded_scales(m, place, qpos, qvel, ctrl, dt, duration) for place in places}
+    found = {place: recorded_scales(m, place, qpos, qvel, ctrl, dt, duration) for place in places}
+    # what a finer simulation predicts is brought to the step of what was recorded, which may be the model's own
+    return {place: dataclasses.replace(own, shift=own.shift * model.refined) for place, own in found.items()}
 
 
 def join(first: Windows, second: Windows) -> Windows:
@@ -298,7 +300,7 @@ def diagnose_case(
         windows=windows,
         chosen=chosen,
         shots=shots,
-        pieces=taken.pieces if named else take(windows, chosen),
+        pieces=taken.pieces if residual else take(windows, chosen),
         result=result,
         flexible=residual.found if residual else None,
         flexible_bench=residual.bench if residual else None,

@@ -28,6 +28,13 @@ def headline(diagnosis: CaseDiagnosis) -> str:
     horizon = diagnosis.model.case.case.horizon
     where = ", ".join(place.at for place in diagnosis.locations[:2])
     held = f"on held-out recordings predictions {horizon:g} s ahead"
+    if result.verdict == "no_mismatch" and result.entries:
+        shift = number(1e3 * diagnosis.bench.largest_shift)
+        return (
+            "Nothing is missing: what the simulator leaves is what its own time step does, which moves things in time "
+            f"by less than {shift} ms; {held} miss by {number(100 * before)} % of a channel's spread, and by less with "
+            "a shorter time step."
+        )
     if result.verdict == "no_mismatch":
         p = result.baseline.misfit.p_value
         return (
@@ -39,7 +46,9 @@ def headline(diagnosis: CaseDiagnosis) -> str:
         if result.entries:
             best = result.entries[0]
             left = number(100 * share_left(best.misfit, result.baseline.misfit))
-            sentence += f" The closest, {' + '.join(best.names)}, leaves {left} % of the misfit."
+            sentence += (
+                f" The closest, {' + '.join(best.names) or 'the time step alone'}, leaves {left} % of the misfit."
+            )
         return sentence
     change = f"{held} miss by {number(100 * after)} % of a channel's spread instead of {number(100 * before)} %"
     if result.verdict == "ambiguous":
@@ -59,8 +68,15 @@ def render(diagnosis: CaseDiagnosis, facts: Mapping[str, Any]) -> str:
     case, result = diagnosis.model.case, diagnosis.result
     out = str(facts.get("folder", "RUN"))
     notices = []
-    if result.verdict == "no_mismatch":
+    if result.verdict == "no_mismatch" and not result.entries:
         notices.append(html.notice("The residuals are as white as noise leaves them.", good=True))
+    if result.confusion and len(result.best.told) < len(result.best.candidate.effects):
+        notices.append(
+            html.notice(
+                "Fitted with it is a shift in time that is shorter than the simulator's time step: its integrator's, "
+                "not the machine's. A shorter step has less of it."
+            )
+        )
     advice = advise(result, diagnosis.experiment)
     if advice:
         notices.append(html.notice(f"Next experiment: {advice}."))
@@ -174,7 +190,9 @@ def _entries(diagnosis: CaseDiagnosis) -> str:
         named = "yes" if entry in diagnosis.result.confusion else ""
         left = share_left(entry.misfit, base.misfit)
         shares = (f"{number(100 * share, 2)} %" if np.isfinite(share) else "" for share in (left, entry.ahead))
-        rows.append([" + ".join(entry.names), number(entry.score - base.score, 4), *shares, named])
+        rows.append(
+            [" + ".join(entry.names) or "the time step alone", number(entry.score - base.score, 4), *shares, named]
+        )
     return html.table(["finalist", "gain on recordings left out", "misfit left", "error ahead left", "named"], rows)
 
 

@@ -128,7 +128,7 @@ def test_a_candidate_has_its_own_parameters_in_physical_units(problem):
     assert [key.rpartition("/")[2] for key in values] == [p.name for p in own]
     np.testing.assert_allclose(list(values.values()), [p.start for p in own], rtol=1e-6)
     both = stribeck + Candidate((0,))
-    assert both.effects == (0, 1) and bench.names(both) == [
+    assert both.effects == (0, 1) and [bench.name(k) for k in both.effects] == [
         "coulomb_friction@joint/hinge",
         "stribeck_friction@joint/hinge",
     ]
@@ -222,6 +222,18 @@ def test_a_special_case_begins_with_the_numbers_of_what_contains_it(problem):
     assert bench.values(special, begun)["coulomb_friction@joint/hinge/coulomb"] == pytest.approx(level)
     same = [bench.replay(candidate, x, bench.shots) for candidate, x in ((general, z), (special, begun))]
     np.testing.assert_allclose(*same, atol=1e-12)
+
+
+@pytest.mark.parametrize(("seconds", "told"), [(0.0015, [0]), (0.0025, [0, 2])])
+def test_a_delay_shorter_than_a_step_is_not_told(problem, seconds, told):
+    scales = {place: dataclasses.replace(own, shift=0.002) for place, own in problem.scales.items()}
+    bench = dataclasses.replace(problem, scales=scales).bench(problem.pairs)
+    both = Candidate((0, 2))
+    level, delay = (bench.each[i].standard(v) for i, v in zip(bench.columns(both), (1e-6, seconds), strict=True))
+    x = jnp.zeros(bench.size).at[bench.d].set(level).at[bench.d + 1].set(delay)
+    assert bench.told(both, x) == told
+    assert bench.largest_shift == 0.002
+    assert problem.bench(problem.pairs).told(both, x) == [0, 2], "a simulator whose step moves nothing"
 
 
 def test_special_cases_take_the_place_of_effects_of_a_set(problem):

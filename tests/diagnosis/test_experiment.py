@@ -38,7 +38,7 @@ def member(bench, k):
         bench.simulator(Candidate((k,))), bench.setup(Candidate((k,))), *given, live=bench.used(Candidate((k,)))
     )
     fit = fit.replace(precision=1e4 * jnp.eye(x.size))
-    return Entry(Candidate((k,)), bench.names(Candidate((k,))), fit, np.zeros(1), None)
+    return Entry(Candidate((k,)), [k], [bench.name(k)], fit, np.zeros(1), None)
 
 
 def library(recording, rows=250):

@@ -20,7 +20,7 @@ class OneParameterEach:
 def entry(names, mean, left, p=0.001, spread=1.0, seed=0):
     scores = mean + spread * np.random.default_rng(seed).normal(size=WINDOWS)
     misfit = Misfit(p, np.full((WINDOWS, 1), left), np.ones(1), np.ones(WINDOWS, bool))
-    return Entry(Candidate(tuple(range(len(names)))), names, None, scores, misfit)
+    return Entry(Candidate(tuple(range(len(names)))), list(range(len(names))), names, None, scores, misfit)
 
 
 def verdict(*entries, none=None):
@@ -133,6 +133,20 @@ def test_a_special_case_stands_for_what_contains_it():
     assert verdict(rotor, gap).best.names == rotor.names
     assert are_kin("coulomb_friction@joint/a", "stribeck_friction@joint/a")
     assert not are_kin("coulomb_friction@joint/a", "coulomb_friction@joint/b")
+
+
+def test_what_the_time_step_does_is_fitted_and_not_named():
+    """A pair with a delay shorter than a step is told by the other's name, once; the delay by itself is nothing."""
+    late = [entry(["a@x"], 100.0, 0.002), entry(["a@x"], 99.0, 0.002), entry(["b@x"], 99.5, 0.002)]
+    for k, each in enumerate(late):
+        each.candidate = Candidate((k, 9))
+    alone = entry(["a@x"], 60.0, 0.02)
+    found = verdict(*late, alone)
+    assert found.verdict == "ambiguous"
+    assert [each.names for each in found.confusion] == [["a@x"], ["b@x"]]
+    assert found.best.candidate == Candidate((0, 9))
+    assert sum(found.probabilities) < 1.0
+    assert verdict(entry([], 100.0, 0.002), entry(["a@x"], 50.0, 0.4)).verdict == "no_mismatch"
 
 
 def test_more_effects_have_to_be_worth_it():
