@@ -27,6 +27,7 @@ from bayessim_jax.diagnosis.verdict import (
     Entry,
     Thresholds,
     are_kin,
+    can_stand_for,
     contains,
     decide,
     error_left,
@@ -497,16 +498,21 @@ def _are_rivals(entry: Entry, best: Entry, none: Entry, thresholds: Thresholds) 
     return replaced and (share_left(entry.misfit, none.misfit) <= thresholds.left or has_special_case(best, entry))
 
 
-def _special_cases(bench: Bench, candidate: Candidate) -> list[Candidate]:
-    """Sets with one effect replaced by a special case of it; those of single effects are finalists anyway."""
+def _stand_ins(bench: Bench, candidate: Candidate) -> list[Candidate]:
+    """Sets with one effect replaced by a special case or a twin of it, as far as there is room for their parameters.
+
+    Those of single effects are finalists anyway.
+    """
     if len(candidate.effects) < 2:
         return []
-    return [
+    seats = [bench.seats(Candidate((k,))).get(bench.name(k), bench.name(k)) for k in range(len(bench.pairs))]
+    found = [
         Candidate(tuple(sorted({*candidate.effects, k} - {effect})))
         for effect in candidate.effects
         for k in range(len(bench.pairs))
-        if k not in candidate.effects and contains(bench.name(effect), bench.name(k))
+        if k not in candidate.effects and can_stand_for(seats[k], seats[effect])
     ]
+    return [each for each in found if len(bench.columns(each)) <= bench.slots]
 
 
 def _with_numbers_of(bench: Bench, best: Entry, other: Candidate, start: Float[Array, " k"]) -> Float[Array, " k"]:
@@ -538,8 +544,8 @@ def _finish(
     The best of those with many parameters that leave more than `remain` says of the motion are fitted from their usual
     values, too: where joints stick and slip, what fits there may be far from what fits in simulation. Rivals of the
     best and parts of it are fitted from its numbers, and where one of them is then the best, rivals from its own: none
-    must win by a better start. Special cases of its effects are tried in their places. What was fitted before is taken
-    as it was.
+    must win by a better start. Special cases and twins of its effects are tried in their places. What was fitted before
+    is taken as it was.
     """
     bench, before = work.bench, dict(work.done)
     work.say(f"simulating {sum(c.candidate not in before for c in candidates)} candidates; compiling takes a while")
@@ -590,7 +596,7 @@ def _finish(
             if best.candidate in before:
                 break
             tried = {entry.candidate for entry in entries}
-            simpler = [s for s in _special_cases(bench, best.candidate) if s not in tried]
+            simpler = [s for s in _stand_ins(bench, best.candidate) if s not in tried]
             begun = [_with_numbers_of(bench, best, s, bench.starts(s, jnp.zeros(bench.d))[-1]) for s in simpler]
             found = pool.map(lambda s, p, best=best: enter(s, p, best.fit.sigma), simpler, begun)
             entries = sorted([*entries, *(e for e in found if e is not None)], key=lambda e: -e.score)

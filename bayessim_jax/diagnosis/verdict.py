@@ -18,6 +18,7 @@ __all__ = [
     "Entry",
     "Thresholds",
     "are_kin",
+    "can_stand_for",
     "contains",
     "decide",
     "error_left",
@@ -39,6 +40,8 @@ CONTAINS = {
     "backlash": ("armature",),
 }
 """Effects that have others as special cases: where both do as well, the simpler one is the finding."""
+TWINS = {"viscous_friction": ("back_emf",), "back_emf": ("viscous_friction",)}
+"""Effects that are the same force at one joint as long as their actuator is on: where one is found, both are tried."""
 MIMICRY = 0.05
 """Chance that what looks like an effect is something else that is in no library."""
 VISIBLE = 0.5
@@ -268,6 +271,12 @@ def contains(one: str, other: str) -> bool:
     """Whether the first effect has the second, at the same place, as a special case."""
     (effect, _, place), (simpler, _, where) = one.partition("@"), other.partition("@")
     return place == where and simpler in CONTAINS.get(effect, ())
+
+
+def can_stand_for(one: str, other: str) -> bool:
+    """Whether the first effect, at the same place, is a special case of the other or a twin of it."""
+    (effect, _, place), (found, _, where) = one.partition("@"), other.partition("@")
+    return contains(other, one) or (place == where and effect in TWINS.get(found, ()))
 
 
 def has_special_case(entry: Entry, other: Entry) -> bool:

@@ -13,7 +13,7 @@ from bayessim_jax.diagnosis.procedure import (
     Problem,
     _folds,
     _log_share,
-    _special_cases,
+    _stand_ins,
     _varied,
     _with_numbers_of,
     detect,
@@ -236,12 +236,16 @@ def test_a_delay_shorter_than_a_step_is_not_told(problem, seconds, told):
     assert problem.bench(problem.pairs).told(both, x) == [0, 2], "a simulator whose step moves nothing"
 
 
-def test_special_cases_take_the_place_of_effects_of_a_set(problem):
+def test_stand_ins_take_the_place_of_effects_of_a_set(problem):
     bench = problem.bench(problem.pairs)
-    assert _special_cases(bench, Candidate((1, 2))) == [Candidate((0, 2))]
-    assert _special_cases(bench, Candidate((0, 2))) == []
-    assert _special_cases(bench, Candidate((0, 1))) == [], "it is in the set already"
-    assert _special_cases(bench, Candidate((1,))) == []
+    assert _stand_ins(bench, Candidate((1, 2))) == [Candidate((0, 2))]
+    assert _stand_ins(bench, Candidate((0, 2))) == []
+    assert _stand_ins(bench, Candidate((0, 1))) == [], "it is in the set already"
+    assert _stand_ins(bench, Candidate((1,))) == []
+    twins = (("viscous_friction", "joint/hinge"), ("back_emf", "actuator/motor"), ("armature", "joint/hinge"))
+    bench = problem.bench([(EFFECTS[name], place) for name, place in twins])
+    assert _stand_ins(bench, Candidate((0, 2))) == [Candidate((1, 2))]
+    assert _stand_ins(bench, Candidate((1, 2))) == [Candidate((0, 2))]
 
 
 def test_pairs_that_are_simulated_differ_in_their_effects():
