@@ -226,7 +226,9 @@ def name_effects(
         worth = thresholds.worth * remain(ranked[0]) if explained else np.inf
         growth = _Growth(screens, begun)
         found = _pair(key, growth, nothing, ranked)
-        pairs = [pair for pair in _varied(found, nothing.score) if remain(pair) < worth]
+        # without a model there is no motion to hold candidates against: what was simulated already is in its order
+        chosen = found[:PAIRS] if isinstance(problem.system, Restarted) else _varied(found, nothing.score)
+        pairs = [pair for pair in chosen if remain(pair) < worth]
         if pairs:
             alone = {k for pair in pairs for k in pair.candidate.effects}
             best = {k for entry in entries[:2] for k in entry.candidate.effects}

@@ -33,7 +33,9 @@ class ActuatorDelay(ActEffect):
         """The delay T."""
         high = scales.timestep * samples_back(scales.timestep)
         start = min(0.02 + 0.37 * scales.timestep, 0.5 * high)
-        return (EffectParameter("seconds", "s", 0.0, high, 0.0, start, scan=4, form=0.01, least=scales.shift),)
+        # a system without a model is simulated from few points, and its rows are its time steps
+        scan = 4 if scales.timestep < scales.period else 0
+        return (EffectParameter("seconds", "s", 0.0, high, 0.0, start, scan=scan, form=0.01, least=scales.shift),)
 
     def begin(self, values: Values, command: Any, moment: Moment) -> Memory:
         """The command as if it had always been the same, the latest first."""
