@@ -185,3 +185,10 @@ def test_the_defaults_are_those_of_the_library():
     assert INFERENCES[settings.scheme] == online.Setup.inferences
     assert settings.proposal == inspect.signature(online.Setup.create).parameters["proposal"].default
     assert settings.encoder == inspect.signature(recurrent_mixture).parameters["encoder"].default
+
+
+def test_a_reader_that_has_seen_enough_is_no_crash():
+    command = [sys.executable, "-c", "from bayessim_jax.cli.main import main; import sys; sys.exit(main())", "--help"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        process.stdout.close()
+        assert (process.stderr.read(), process.wait(timeout=60)) == ("", 1)
