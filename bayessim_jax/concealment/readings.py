@@ -43,8 +43,9 @@ class SensorScale(SenseLaw):
 
     @classmethod
     def make(cls, spot: Spot, amplitude: float, rng: np.random.Generator) -> SensorScale:
-        """Too much or too little."""
-        return cls(spot, 1.0 + amplitude if rng.uniform() < 0.5 else 1.0 / (1.0 + amplitude))
+        """Too much or too little, fivefold at most: less is a sensor that shows nothing."""
+        scale = 1.0 + min(amplitude, 4.0)
+        return cls(spot, scale if rng.uniform() < 0.5 else 1.0 / scale)
 
     def read(self, time: Steps, q: Steps, rng: np.random.Generator) -> Steps:
         """The product."""

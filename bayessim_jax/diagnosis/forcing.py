@@ -89,7 +89,10 @@ def force_of(
             first = jax.tree.map(lambda a: a[0], rows)
             begun = jax.tree.map(lambda m: jnp.asarray(m, time.dtype), effect.begin(values, moment(*first)))
             if earlier is not None:
-                begun = effect.recall(values, begun, *earlier, period)
+                positions, velocities, drives = earlier
+                start = moment(*first)
+                motion = jnp.append(positions, start.position), jnp.append(velocities, start.velocity)
+                begun = effect.recall(values, begun, *motion, drives, period)
             if not jax.tree.leaves(begun):
                 return jax.vmap(lambda now: once(begun, now)[1])(rows).reshape(-1, steps).mean(-1)
             return jax.lax.scan(once, begun, rows)[1].reshape(-1, steps).mean(-1)

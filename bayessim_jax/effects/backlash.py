@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import mujoco
+from jaxtyping import Array
 
 from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Scales, Values
 from bayessim_jax.effects.places import driving_actuators
 
 __all__ = ["Backlash"]
+
+PARTS = 8
+"""Steps of a motor that is recalled in one of the recording."""
+TINY = 1e-12
 
 
 class Backlash(ForceEffect):
@@ -22,6 +28,7 @@ class Backlash(ForceEffect):
 
     name = "backlash"
     holds = True
+    recalls = True
 
     def places(self, model: mujoco.MjModel) -> list[str]:
         """Every actuator of a hinge or slide."""
@@ -39,6 +46,34 @@ class Backlash(ForceEffect):
         """θ and θ̇ of a motor that moves with the joint, at the end of the gap to which it presses."""
         load = _rigid(values, moment)
         return moment.position + 0.5 * values["gap"] * jnp.sign(load), moment.velocity
+
+    def recall(
+        self, values: Values, memory: Memory, positions: Array, velocities: Array, drives: Array, h: float
+    ) -> Memory:
+        """θ and θ̇ of a motor within a gap that moves as recorded, on cubics between the rows.
+
+        It begins at the end to which the drive presses it; from the first time that it meshes this no longer matters.
+        """
+        rotor, half, step = jnp.maximum(values["rotor_inertia"], TINY), 0.5 * values["gap"], h / PARTS
+        late = jnp.arange(1, PARTS + 1) / PARTS
+
+        def once(motor: tuple[Array, Array], now: tuple[Array, ...]) -> tuple[tuple[Array, Array], None]:
+            angle, speed = motor
+            position, velocity, push = now
+            angle = angle + step * (speed + 0.5 * step * push)
+            speed = speed + step * push
+            above, below = angle >= position + half, angle <= position - half
+            speed = jnp.where(above, jnp.minimum(speed, velocity), speed)
+            speed = jnp.where(below, jnp.maximum(speed, velocity), speed)
+            return (jnp.clip(angle, position - half, position + half), speed), None
+
+        begun, rate, last = positions[:-1, None], velocities[:-1, None], velocities[1:, None]
+        mean = jnp.diff(positions)[:, None] / h
+        bend = late * (1.0 - late) * ((1.0 - late) * (rate - mean) - late * (last - mean))
+        path, rates = begun + h * (late * mean + bend), rate + late * (last - rate)
+        pushes = jnp.broadcast_to(drives[:, None] / rotor, path.shape)
+        first = positions[0] + half * jnp.sign(drives[0]), velocities[0]
+        return jax.lax.scan(once, first, (path.ravel(), rates.ravel(), pushes.ravel()))[0]
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
         """λ − τ_m."""

@@ -256,13 +256,17 @@ class ForceEffect(Effect, Protocol):
     def recall(
         self, values: Values, memory: Memory, positions: Array, velocities: Array, drives: Array, h: float
     ) -> Memory:
-        """The memory after a joint has moved so under what actuators exerted on it, in steps of h s."""
+        """The memory after a joint has moved so under what actuators exerted on it, in steps of h s.
+
+        Positions and velocities are those at both ends of every step, one more than drives; the last are those of the
+        state in which a simulation begins.
+        """
 
         def once(memory: Memory, now: tuple[Array, Array, Array]) -> tuple[Memory, None]:
             position, velocity, drive = now
             return self.force(values, memory, Moment(jnp.zeros(()), h, position, velocity, drive=drive))[1], None
 
-        return jax.lax.scan(once, memory, (positions, velocities, drives))[0]
+        return jax.lax.scan(once, memory, (positions[:-1], velocities[:-1], drives))[0]
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
         """The force during the time step, N or N m, and the memory for the next one."""

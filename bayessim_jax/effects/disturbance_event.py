@@ -28,11 +28,11 @@ class DisturbanceEvent(ForceEffect):
 
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """t₀, t₁ and P."""
-        duration, impulse = scales.duration, 4.0 * scales.inertia * scales.speed
+        duration, impulse = scales.duration, 12.0 * scales.inertia * scales.speed
         return (
             EffectParameter("start", "s", 0.0, duration, 0.45 * duration, 0.45 * duration, scan=8, form=0.05),
             EffectParameter("end", "s", 0.0, duration, 0.55 * duration, 0.55 * duration, scan=8, form=0.05),
-            EffectParameter("impulse", f"{scales.force_unit} s", -impulse, impulse, 0.0, 0.05 * impulse, form=0.01),
+            EffectParameter("impulse", f"{scales.force_unit} s", -impulse, impulse, 0.0, 0.02 * impulse, form=0.01),
         )
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:

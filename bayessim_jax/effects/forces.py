@@ -88,13 +88,15 @@ def recall_motion(
     ctrl: Float[Array, "periods act"],
 ) -> AugmentedState:
     """The memories of effects that remember how their joint has moved, and under which commands."""
-    recalled = {}
+    recalled, physics = {}, state.base.physics
     for k, w in rig.at("force"):
         if w.effect.recalls:
             q, v = rig.address(w.site.joint)
             position, velocity = qpos[:, q], qvel[:, v]
             drive = drive_of(rig.model, numbers, actuators_of(rig.model, w.site.joint), ctrl.T, position, velocity)
             drives = drive + jnp.zeros_like(position)
+            position = jnp.append(position, rig.engine.qpos(physics)[q])
+            velocity = jnp.append(velocity, rig.engine.qvel(physics)[v])
             recalled[k] = w.effect.recall(w.values(theta), state.memories[k], position, velocity, drives, rig.dt)
     return state.with_memories(recalled)
 

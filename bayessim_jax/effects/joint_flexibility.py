@@ -74,8 +74,7 @@ class JointFlexibility(ForceEffect):
         x = jnp.arange(min(len(velocities), SLOPE)) * h
         slope = jnp.sum((x - x.mean()) * velocities[: len(x)]) / jnp.maximum(jnp.sum((x - x.mean()) ** 2), TINY)
         begun = jnp.stack([positions[0] + (drives[0] - rotor * slope) / k, velocities[0]])
-        last = positions[-1] + h * velocities[-1], velocities[-1]
-        between = [0.5 * (a + jnp.append(a[1:], b)) for a, b in zip((positions, velocities), last, strict=True)]
+        between = [0.5 * (x[:-1] + x[1:]) for x in (positions, velocities)]
         rest = (drives + d * between[1]) / k + between[0]
         ahead = _ringing(0.5 * d / rotor, k / rotor, h)
 

@@ -33,7 +33,7 @@ class JointSpring(ForceEffect):
         low, high = scales.centre - 2.0 * reach, scales.centre + 2.0 * reach
         return (
             EffectParameter("stiffness", unit, 0.0, k, 0.0, 0.05 * k),
-            EffectParameter("reference", scales.unit, low, high, scales.centre, scales.centre),
+            EffectParameter("reference", scales.unit, low, high, scales.centre, scales.centre, scan=4),
             EffectParameter("cubic", f"{unit}³", -cubic, cubic, 0.0, 0.01 * cubic),
         )
 

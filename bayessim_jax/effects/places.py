@@ -21,6 +21,7 @@ __all__ = [
     "has_rate",
     "joints",
     "movable_bodies",
+    "turned_joint",
 ]
 
 SCALAR = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
@@ -89,6 +90,17 @@ def find_body(model: mujoco.MjModel, place: str) -> int:
         known = ", ".join(movable_bodies(model))
         raise ValueError(f"place {place!r}: the model has no such body; take one of {known}.")
     return number
+
+
+def turned_joint(model: mujoco.MjModel, place: str) -> int:
+    """The joint whose zero is turned by an encoder, by a tilted base or by what hangs from it aside, or −1."""
+    where, what = at(place), detail(place)
+    if what == "across":
+        body = find_body(model, place)
+        last = not (model.body_parentid == body).any() and model.body_jntnum[body] == 1
+        return int(model.body_jntadr[body]) if last else -1
+    name = what if where == "world" else where.removesuffix("/qpos") if where.endswith("/qpos") else ""
+    return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name.removeprefix("joint/")) if name else -1
 
 
 def driven_joint(model: mujoco.MjModel, actuator: int) -> int:

@@ -141,7 +141,7 @@ def test_a_rotor_is_recalled_as_it_rang(k, d, rotor):
             angle, speed = np.array([rest, 0.0]) + ahead @ (np.array([angle, speed]) - np.array([rest, 0.0]))
     values = {"stiffness": k, "damping": d, "rotor_inertia": rotor}
     recalled = EFFECTS["joint_flexibility"].recall(
-        values, (0.0, 0.0), *map(jnp.asarray, (position[:-1], velocity[:-1], drive)), h
+        values, (0.0, 0.0), *map(jnp.asarray, (position, velocity, drive)), h
     )
     assert float(recalled[0]) == pytest.approx(angle, abs=0.02 * np.ptp(position))
     bend, wanted = float(recalled[0]) - position[-1], angle - position[-1]
@@ -278,10 +278,35 @@ def test_bristles_are_recalled_as_they_bent(moved):
     level, stiffness, h = 2.0, 500.0, 1e-4
     values = {"stiffness": stiffness, "damping": 3.0, "coulomb": level, "static": level, "velocity": 0.1}
     back = round(moved * level / stiffness / (0.1 * h))
-    velocities = jnp.concatenate([jnp.full(3000, 0.1), jnp.full(back, -0.1)])
+    velocities = jnp.concatenate([jnp.full(3000, 0.1), jnp.full(back + 1, -0.1)])
     still = jnp.zeros_like(velocities)
-    bent = EFFECTS["lugre_friction"].recall(values, jnp.zeros(()), still, velocities, still, h)
+    bent = EFFECTS["lugre_friction"].recall(values, jnp.zeros(()), still, velocities, still[1:], h)
     assert float(bent) == pytest.approx(-level + 2 * level * np.exp(-moved), abs=0.01 * level)
+
+
+@pytest.mark.parametrize("rows", [150, 158, 165, 180, 201])
+def test_a_motor_is_recalled_where_it_was_within_its_gap(rows):
+    """Against the same motor in steps a hundred times as fine: pressed to either end, and on its way between them."""
+    h, many, rotor, gap = 0.01, 800, 0.02, 0.05
+    t = h * np.arange(rows)
+    drive = 0.05 * np.sign(np.sin(4.0 * t[:-1]))
+    angle, speed, where = 0.5 * gap * np.sign(drive[0]), 0.5, []
+    for i in range(rows - 1):
+        for part in range(many):
+            now = t[i] + h * (part + 1) / many
+            speed += h / many * drive[i] / rotor
+            angle += h / many * speed
+            q, v = 0.1 * np.sin(5.0 * now), 0.5 * np.cos(5.0 * now)
+            if abs(angle - q) >= 0.5 * gap:
+                end = np.sign(angle - q)
+                angle, speed = q + 0.5 * gap * end, end * min(end * speed, end * v)
+        where.append((angle - q) / gap)
+    assert min(where) < -0.499 and max(where) > 0.499 and np.mean(np.abs(where) < 0.4) > 0.1
+    motion = map(jnp.asarray, (0.1 * np.sin(5.0 * t), 0.5 * np.cos(5.0 * t), drive))
+    values = {"gap": gap, "rotor_inertia": rotor}
+    recalled = EFFECTS["backlash"].recall(values, (0.0, 0.0), *motion, h)
+    assert float(recalled[0]) == pytest.approx(angle, abs=0.01 * gap)
+    assert float(recalled[1]) == pytest.approx(speed, abs=0.02)
 
 
 @pytest.mark.parametrize("prompt", [False, True])
