@@ -293,11 +293,12 @@ def summarize(rows: list[dict[str, Any]]) -> str:
             parts.append(f"joint right {sum(located)} of {len(located)}")
         parts.append(f"library without abstention: wrong in {sum(_is_wrong(row) for row in members)}")
         lines.append(f"{group:<8} {len(members):>4}: {', '.join(parts)}")
-    absorbed = [
-        row for row in rows if row["outcome"] == "missed" and row["nrmse"]["baseline"] < ABSORBED * row["noise_floor"]
-    ]
-    if absorbed:
-        lines.append(f"of those missed, {len(absorbed)} predict within a tenth of the noise without the effect")
+    for outcome, told, simulator in (("missed", "missed", "baseline"), ("part", "told in part", "augmented")):
+        alike = [row["nrmse"][simulator] < ABSORBED * row["noise_floor"] for row in rows if row["outcome"] == outcome]
+        if any(alike):
+            lines.append(
+                f"of the {len(alike)} {told}, {sum(alike)} predict within a tenth of the noise without the rest"
+            )
     lines += [*_predictions(rows), *_coverage(rows)]
     seconds = np.array([row["seconds"] for row in rows])
     if len(seconds):

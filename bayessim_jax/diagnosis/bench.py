@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Scalar
 from bayessim_jax.beliefs.margins import Margin, Margins, log_uniform, uniform, values_between
 from bayessim_jax.effects import EffectParameter, Scales, at, with_effects
 from bayessim_jax.effects.attach import wire
+from bayessim_jax.effects.places import turned_joint
 from bayessim_jax.inference.replay import Inputs, Restarted, replay_window
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS, DAMPING, Fit, Shots, predict_all, solve
 from bayessim_jax.programs import trace_once
@@ -184,14 +185,16 @@ class Bench:
         return found
 
     def seats(self, candidate: Candidate) -> dict[str, str]:
-        """Names of a candidate's effects on actuators, and the same at the joint that is driven."""
-        found = {}
-        system: Any = self.system
+        """Names of effects, and the same at the joint that their actuator drives or whose zero they turn."""
+        found: dict[str, str] = {}
+        if isinstance(self.system, Restarted):
+            return found
+        model = self.system.engine.model
         for k in candidate.effects:
             effect, place = self.pairs[k]
-            joint = self.wired[k].site.joint
-            if place.startswith("actuator/") and joint >= 0:
-                found[self.name(k)] = f"{effect.name}@joint/{system.engine.model.joint(joint).name}"
+            joint = self.wired[k].site.joint if place.startswith("actuator/") else turned_joint(model, place)
+            if joint >= 0:
+                found[self.name(k)] = f"{effect.name}@joint/{model.joint(joint).name}"
         return found
 
     def columns(self, candidate: Candidate) -> list[int]:

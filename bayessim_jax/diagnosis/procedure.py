@@ -273,6 +273,7 @@ def _widest(bench: Bench, none: Entry, entries: Sequence[Entry]) -> list[Entry]:
 
 def _settled(screen: Screen, entry: Entry, kept: Sequence[Screened]) -> Screened:
     """What was found in simulation, fitted along the motion again."""
+    # a twin may not have been along the motion before; the corrections of the best that was do as a beginning
     known = next((found for found in kept if found.candidate == entry.candidate), kept[0])
     return screen.settle(entry.candidate, entry.fit.z, known.delta, entry.fit.sigma) or known
 
@@ -343,11 +344,20 @@ def _quiet(text: str) -> None:
 
 def _begin_work(key: PRNGKeyArray, problem: Problem, say: Callable[[str], None]) -> _Work:
     """The bench on which candidates are simulated, and nothing done."""
-    bench, inputs = problem.bench(problem.pairs), problem.shots.inputs
-    memory = inputs.past.shape[1] * problem.system.dt
-    remembered = np.asarray(inputs.time) > memory - 0.5 * problem.system.dt
-    enough = remembered if remembered.mean() > ENOUGH else None
-    return _Work(key, bench, problem.group, noise_floor(bench.shots), say, enough)
+    bench = problem.bench(problem.pairs)
+    return _Work(key, bench, problem.group, noise_floor(bench.shots), say, _remembered(bench, bench.shots))
+
+
+def _remembered(bench: Bench, shots: Shots) -> Bool[np.ndarray, " windows"] | None:
+    """Windows before which so much was recorded as effects look back; None where these are few."""
+    dt = bench.system.dt
+    there = np.asarray(shots.inputs.time) > shots.inputs.past.shape[1] * dt - 0.5 * dt
+    return there if there.mean() > ENOUGH else None
+
+
+def _recalls(bench: Bench, candidate: Candidate) -> bool:
+    """Whether what a joint's motion has left in an effect when a recording begins matters, and is not known."""
+    return any(getattr(bench.pairs[k][0], "recalls", False) for k in candidate.effects)
 
 
 def _each(screens: Sequence[Screen], items: Sequence[T], do: Callable[[Screen, T], R]) -> list[R]:
@@ -490,7 +500,7 @@ def _replace(work: _Work, entries: list[Entry], pairs: Iterable[tuple[Entry, Ent
     for before, entry in pairs:
         if entry is not before:
             entries[entries.index(before)] = entry
-            work.say(f"{' + '.join(entry.names)}: score {entry.score:.1f}, begun elsewhere")
+            work.say(f"{entry.title}: score {entry.score:.1f}, begun elsewhere")
     entries.sort(key=lambda entry: -entry.score)
 
 
@@ -579,7 +589,7 @@ def _finish(
             if entry is not None:
                 entries.append(entry)
                 if entry.candidate not in before:
-                    work.say(f"{' + '.join(entry.names)}: score {entry.score:.1f}")
+                    work.say(f"{entry.title}: score {entry.score:.1f}")
         entries.sort(key=lambda entry: -entry.score)
         screened = {found.candidate: found for found in candidates}
         explained = bool(entries) and share_left(entries[0].misfit, none.misfit) <= thresholds.left
@@ -618,12 +628,14 @@ def _look_ahead(bench: Bench, none: Entry, entries: Sequence[Entry], ahead: Shot
 
     Initial states are off by what the best candidate's fit moved them.
     """
-    best = entries[0]
+    best, remembered = entries[0], _remembered(bench, ahead)
+    there = ahead.measured if remembered is None else ahead.measured & remembered[:, None, None]
     with ThreadPoolExecutor(WORKERS) as pool:
         base, *predicted = pool.map(lambda e: bench.replay(e.candidate, e.fit.z, ahead), [none, *entries])
     spread = np.nan_to_num(bench.scatter(best.candidate, best.fit.z, ahead, best.fit.usual_move, predicted[0]))
     for entry, here in zip(entries, predicted, strict=True):
-        entry.ahead = error_left(ahead, here, base, entry.misfit.noise, spread)
+        known = dataclasses.replace(ahead, measured=there) if _recalls(bench, entry.candidate) else ahead
+        entry.ahead = error_left(known, here, base, entry.misfit.noise, spread)
 
 
 def _folds(group: Int[np.ndarray, " windows"]) -> Bool[Array, "folds windows"]:
@@ -642,9 +654,7 @@ def _enter(work: _Work, candidate: Candidate, fit: Fit, known: Float[np.ndarray,
     )
     scores = np.nan_to_num(np.asarray(scores), nan=-1e12)
     misfit_key = jax.random.fold_in(work.key, crc32(" ".join(map(bench.label, candidate.effects)).encode()))
-    # what a joint's motion has left in an effect when a recording begins is not known
-    recalls = any(getattr(bench.pairs[k][0], "recalls", False) for k in candidate.effects)
-    judged = work.remembered if recalls else None
+    judged = work.remembered if _recalls(bench, candidate) else None
     misfit = judge_misfit(misfit_key, fit.misses, fit.along_states, np.asarray(measured), known, judged)
     share, seats = _log_share(bench, candidate, fit), bench.seats(candidate)
     told = bench.told(candidate, fit.z)

@@ -53,7 +53,7 @@ BEYOND = 3.0
 BLUR = 0.05
 """Of s as they tell it: standard deviation for what trapezoids leave of an integral."""
 PIECE, FEWEST = 0.15, 30
-"""s over which positions and velocities are compared, and so many pieces at least."""
+"""Seconds over which positions and velocities are compared, and how many such pieces it takes at least."""
 RATIO = normal(1 / 3, 1 / 3)
 """What is believed of s."""
 

@@ -46,13 +46,11 @@ def headline(diagnosis: CaseDiagnosis) -> str:
         if result.entries:
             best = result.entries[0]
             left = number(100 * share_left(best.misfit, result.baseline.misfit))
-            sentence += (
-                f" The closest, {' + '.join(best.names) or 'the time step alone'}, leaves {left} % of the misfit."
-            )
+            sentence += f" The closest, {best.title}, leaves {left} % of the misfit."
         return sentence
     change = f"{held} miss by {number(100 * after)} % of a channel's spread instead of {number(100 * before)} %"
     if result.verdict == "ambiguous":
-        sets = " or ".join(" + ".join(entry.names) for entry in result.confusion)
+        sets = " or ".join(entry.title for entry in result.confusion)
         return f"Missing is {sets}; these recordings cannot tell which. With the first, {change}."
     parts = []
     for effect in table["effects"]:
@@ -190,9 +188,7 @@ def _entries(diagnosis: CaseDiagnosis) -> str:
         named = "yes" if entry in diagnosis.result.confusion else ""
         left = share_left(entry.misfit, base.misfit)
         shares = (f"{number(100 * share, 2)} %" if np.isfinite(share) else "" for share in (left, entry.ahead))
-        rows.append(
-            [" + ".join(entry.names) or "the time step alone", number(entry.score - base.score, 4), *shares, named]
-        )
+        rows.append([entry.title, number(entry.score - base.score, 4), *shares, named])
     return html.table(["finalist", "gain on recordings left out", "misfit left", "error ahead left", "named"], rows)
 
 

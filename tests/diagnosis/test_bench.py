@@ -246,6 +246,13 @@ def test_stand_ins_take_the_place_of_effects_of_a_set(problem):
     bench = problem.bench([(EFFECTS[name], place) for name, place in twins])
     assert _stand_ins(bench, Candidate((0, 2))) == [Candidate((1, 2))]
     assert _stand_ins(bench, Candidate((1, 2))) == [Candidate((0, 2))]
+    places = {"sensor_offset": "joint/hinge/qpos", "base_tilt": "world#joint/hinge", "link_offset": "body/rod#across"}
+    zeros = [*places.items(), ("link_offset", "body/rod"), ("armature", "joint/hinge")]
+    problem = dataclasses.replace(problem, scales={place: Scales(timestep=0.002, period=0.004) for _, place in zeros})
+    bench = problem.bench([(EFFECTS[name], place) for name, place in zeros])
+    for one, others in ((0, (1, 2)), (1, (0, 2)), (2, (0, 1))):
+        assert _stand_ins(bench, Candidate((one, 4))) == [Candidate((other, 4)) for other in others]
+    assert _stand_ins(bench, Candidate((3, 4))) == [], "along the link it is a length"
 
 
 def test_pairs_that_are_simulated_differ_in_their_effects():

@@ -116,6 +116,18 @@ def test_what_noise_in_initial_states_costs_ahead_is_no_error_of_a_candidate():
     assert np.isnan(error_left(shots, right, right, noise, spread))
 
 
+def test_what_chaos_excuses_in_one_window_excuses_nothing_in_another():
+    """Half of the windows cannot be predicted, and nobody does much worse there; in the others a third is left."""
+    rng, shape = np.random.default_rng(0), (40, 50, 1)
+    y = 0.1 * rng.normal(size=shape)
+    shots = Shots(None, y, np.ones(shape, bool), np.ones(1))
+    chaotic = np.arange(40)[:, None, None] < 20
+    base, half = np.full(shape, 3.0), np.where(chaotic, 0.3, np.sqrt(3.0)) * np.ones(shape)
+    spread = np.where(chaotic, 4.0, 0.0) * np.ones(shape)
+    left = error_left(shots, half, base, np.full(1, 0.1), spread)
+    assert left == pytest.approx(20 * 3.0 / (20 * 5.0 + 20 * 9.0), rel=0.1)
+
+
 def test_a_tie_with_what_does_not_explain_is_no_confusion():
     assert verdict(entry(["a@x"], 100.0, 0.002), entry(["b@x"], 100.0, 0.3, seed=1)).verdict == "explained"
 
