@@ -32,7 +32,7 @@ __all__ = ["NEAR", "SLOTS", "Bench", "Candidate", "CandidatesOf", "begin_point",
 
 NEAR = 0.1
 """Of the way from an effect's neutral value to where a fit usually begins: weak effects are found from there."""
-SLOTS = 6
+SLOTS = 10
 """Parameters that a candidate may have beside θ."""
 
 

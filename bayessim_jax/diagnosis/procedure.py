@@ -36,6 +36,7 @@ from bayessim_jax.diagnosis.verdict import (
     is_worth,
     may_be_named,
     share_left,
+    ties,
 )
 from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, judge_misfit
 from bayessim_jax.effects import Scales
@@ -513,16 +514,15 @@ def _are_rivals(entry: Entry, best: Entry, none: Entry, thresholds: Thresholds) 
 def _stand_ins(bench: Bench, candidate: Candidate) -> list[Candidate]:
     """Sets with one effect replaced by a special case or a twin of it, as far as there is room for their parameters.
 
-    Those of single effects are finalists anyway.
+    Twins of single effects are finalists anyway.
     """
-    if len(candidate.effects) < 2:
-        return []
+    stands_for = can_stand_for if len(candidate.effects) > 1 else lambda one, other: contains(other, one)
     seats = [bench.seats(Candidate((k,))).get(bench.name(k), bench.name(k)) for k in range(len(bench.pairs))]
     found = [
         Candidate(tuple(sorted({*candidate.effects, k} - {effect})))
         for effect in candidate.effects
         for k in range(len(bench.pairs))
-        if k not in candidate.effects and can_stand_for(seats[k], seats[effect])
+        if k not in candidate.effects and stands_for(seats[k], seats[effect])
     ]
     return [each for each in found if len(bench.columns(each)) <= bench.slots]
 
@@ -556,8 +556,8 @@ def _finish(
     The best of those with many parameters that leave more than `remain` says of the motion are fitted from their usual
     values, too: where joints stick and slip, what fits there may be far from what fits in simulation. Rivals of the
     best and parts of it are fitted from its numbers, and where one of them is then the best, rivals from its own: none
-    must win by a better start. Special cases and twins of its effects are tried in their places. What was fitted before
-    is taken as it was.
+    must win by a better start. Special cases and twins of the effects of what ties for the best are tried in their
+    places. What was fitted before is taken as it was.
     """
     bench, before = work.bench, dict(work.done)
     work.say(f"simulating {sum(c.candidate not in before for c in candidates)} candidates; compiling takes a while")
@@ -608,9 +608,11 @@ def _finish(
             if best.candidate in before:
                 break
             tried = {entry.candidate for entry in entries}
-            simpler = [s for s in _stand_ins(bench, best.candidate) if s not in tried]
-            begun = [_with_numbers_of(bench, best, s, bench.starts(s, jnp.zeros(bench.d))[-1]) for s in simpler]
-            found = pool.map(lambda s, p, best=best: enter(s, p, best.fit.sigma), simpler, begun)
+            tied = [entry for entry in entries if ties(entry, best, none, thresholds)]
+            alike = [(s, entry) for entry in tied for s in _stand_ins(bench, entry.candidate) if s not in tried]
+            simpler = list({s: (s, entry) for s, entry in reversed(alike)}.values())[::-1][:AGAIN]
+            begun = [_with_numbers_of(bench, e, s, bench.starts(s, jnp.zeros(bench.d))[-1]) for s, e in simpler]
+            found = pool.map(lambda pair, p: enter(pair[0], p, pair[1].fit.sigma), simpler, begun)
             entries = sorted([*entries, *(e for e in found if e is not None)], key=lambda e: -e.score)
             rivals = [entry for entry in entries if _are_rivals(entry, best, none, thresholds)][:AGAIN]
             rivals += [entry for entry in entries if set(entry.names) < set(best.names)]

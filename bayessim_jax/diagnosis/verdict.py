@@ -27,6 +27,7 @@ __all__ = [
     "is_worth",
     "may_be_named",
     "share_left",
+    "ties",
 ]
 
 CONTAINS = {
@@ -43,11 +44,13 @@ CONTAINS = {
 TWINS = {
     "viscous_friction": ("back_emf",),
     "back_emf": ("viscous_friction",),
+    "lugre_friction": ("hysteresis",),
+    "hysteresis": ("lugre_friction",),
     "sensor_offset": ("link_offset", "base_tilt"),
     "link_offset": ("sensor_offset", "base_tilt"),
     "base_tilt": ("sensor_offset", "link_offset"),
 }
-"""Effects that may be the same at one joint: a brake, while its actuator is on, and what turns the zero of an angle.
+"""Effects that look the same at one joint: brakes, what bends before it yields, and what turns the zero of an angle.
 
 Where one is found, the others are tried.
 """
@@ -71,6 +74,8 @@ class Thresholds:
     """Share of the baseline's error of predictions ahead that an explanation of the misfit may leave."""
     both: float = 0.001
     """The one share times the other: what leaves something of both has found something else."""
+    several: float = 0.0001
+    """The same for more effects than one, which come near to more that is none of them."""
     most: float = 0.1
     """The same product, above which an effect explains nothing, though no misfit of pieces can be detected."""
     foreseen: float = 0.003
@@ -211,7 +216,7 @@ def decide(
     result = Diagnosis("unexplained", bench, none, entries, screened=screened)
     if not entries or entries[0].score - none.score < thresholds.least:
         return result
-    tied = [entry for entry in entries if _ties(entry, entries[0], none, thresholds)]
+    tied = [entry for entry in entries if ties(entry, entries[0], none, thresholds)]
     # what more effects explain has to be worth them: another law of the same effect leaves a rest, too
     tied += [entry for entry in entries if entry not in tied and _suffices(entry, tied, none, thresholds)]
     tied = [entry for entry in tied if explains(entry, none, thresholds) and is_worth(entry, entries, none, thresholds)]
@@ -234,7 +239,7 @@ def decide(
 
 def may_be_named(entry: Entry, entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:
     """Whether a candidate ties for the best of `entries`, which comes first, or is a part of one that does."""
-    tied = (other for other in entries if _ties(other, entries[0], none, thresholds))
+    tied = (other for other in entries if ties(other, entries[0], none, thresholds))
     return any(set(entry.names) <= set(other.names) for other in tied)
 
 
@@ -245,10 +250,10 @@ def explains(entry: Entry, none: Entry, thresholds: Thresholds) -> bool:
     not judged where its past is unknown is excused there already, and has to explain the pieces that are judged.
     """
     foreseen = entry.ahead <= thresholds.foreseen and bool(entry.misfit.judged.all())
-    left = share_left(entry.misfit, none.misfit)
+    left, both = share_left(entry.misfit, none.misfit), thresholds.both if len(entry.names) < 2 else thresholds.several
     if foreseen or (entry.misfit.p_value >= FALSE_ALARMS and not left * entry.ahead > thresholds.most):
         return True
-    return left <= thresholds.left and not (entry.ahead > thresholds.ahead or left * entry.ahead > thresholds.both)
+    return left <= thresholds.left and not (entry.ahead > thresholds.ahead or left * entry.ahead > both)
 
 
 def _suffices(entry: Entry, tied: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:
@@ -269,7 +274,7 @@ def is_worth(entry: Entry, entries: Sequence[Entry], none: Entry, thresholds: Th
     return all(left <= thresholds.worth * share_left(part.misfit, none.misfit) for part in parts)
 
 
-def _ties(entry: Entry, best: Entry, none: Entry, thresholds: Thresholds) -> bool:
+def ties(entry: Entry, best: Entry, none: Entry, thresholds: Thresholds) -> bool:
     """Whether a candidate predicts held-out windows as well as the best one, within the error of the difference.
 
     Where the best one leaves something, too, small differences say who mimics what is left rather than who is right.

@@ -184,7 +184,7 @@ def test_a_set_that_wins_in_few_recordings_is_less_probable():
 def test_a_set_is_widened_only_where_it_is_worth_its_effects_and_is_not_enough():
     none = entry([], 0.0, 1.0)
     alone, other = entry(["a@x"], 100.0, 0.5), entry(["b@x"], 90.0, 0.6, seed=1)
-    cases = ((0.1, 0.2, True), (0.01, 0.2, True), (0.02, 0.02, True), (0.01, 0.01, False), (0.4, 0.2, False))
+    cases = ((0.1, 0.2, True), (0.01, 0.2, True), (0.02, 0.02, True), (0.01, 0.005, False), (0.4, 0.2, False))
     for left, ahead, wanted in cases:
         pair = entry(["a@x", "b@x"], 200.0, left, seed=2)
         pair.ahead = ahead
