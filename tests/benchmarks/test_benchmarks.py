@@ -47,7 +47,7 @@ def test_an_unknown_benchmark_is_refused_in_one_line():
     assert done.returncode == 2 and "invalid choice" in done.stderr and "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("kept", [f"concealed_{set_}" for set_ in ("44", "45", "46", "48", "48_again", "51", "52")])
+@pytest.mark.parametrize("kept", [f"concealed_{set_}" for set_ in ("44", "45", "46", "48", "48_again", "51", "52", "55", "56")])
 def test_the_scoreboards_of_the_docs_are_printed_from_the_records(kept):
     root = Path(__file__).parents[2]
     rows = [json.loads(line) for line in (root / f"benchmarks/results/{kept}.jsonl").read_text().splitlines()]
