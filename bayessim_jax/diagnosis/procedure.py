@@ -555,8 +555,8 @@ def _finish(
 
     The best of those with many parameters that leave more than `remain` says of the motion are fitted from their usual
     values, too: where joints stick and slip, what fits there may be far from what fits in simulation. Rivals of the
-    best and parts of it are fitted from its numbers, and where one of them is then the best, rivals from its own: none
-    must win by a better start. Special cases and twins of the effects of what ties for the best are tried in their
+    best and parts of it are fitted from its numbers, and where one of them is then the best or ties with it, so are its
+    own: none must win by a better start. Special cases and twins of the effects of what ties for the best are tried in their
     places. What was fitted before is taken as it was.
     """
     bench, before = work.bench, dict(work.done)
@@ -617,7 +617,8 @@ def _finish(
             rivals = [entry for entry in entries if _are_rivals(entry, best, none, thresholds)][:AGAIN]
             rivals += [entry for entry in entries if set(entry.names) < set(best.names)]
             _replace(work, entries, zip(rivals, pool.map(partial(from_numbers_of, best), rivals), strict=True))
-            if entries[0] is best:
+            now_tied = {entry.candidate for entry in entries if ties(entry, best, none, thresholds)}
+            if entries[0] is best and now_tied <= {entry.candidate for entry in tied}:
                 break
     work.done |= {entry.candidate: entry for entry in entries}
     if ahead is not None and entries:
