@@ -556,8 +556,8 @@ def _finish(
     The best of those with many parameters that leave more than `remain` says of the motion are fitted from their usual
     values, too: where joints stick and slip, what fits there may be far from what fits in simulation. Rivals of the
     best and parts of it are fitted from its numbers, and where one of them is then the best or ties with it, so are its
-    own: none must win by a better start. Special cases and twins of the effects of what ties for the best are tried in their
-    places. What was fitted before is taken as it was.
+    own: none must win by a better start. Special cases and twins of the effects of what ties for the best are tried
+    in their places. What was fitted before is taken as it was.
     """
     bench, before = work.bench, dict(work.done)
     work.say(f"simulating {sum(c.candidate not in before for c in candidates)} candidates; compiling takes a while")
