@@ -208,8 +208,15 @@ class Bench:
         return Simulator(self.system, self.margins, pairs, self.scales, kinds)
 
     def setup(self, candidate: Candidate, shots: Shots | None = None) -> Shots:
-        """The windows (or others) as a candidate's simulator takes them."""
+        """The windows (or others) as a candidate's simulator takes them.
+
+        Where some of its effects remember what the state in which a window begins does not tell, its initial states
+        have a number more for each.
+        """
         every = self.shots if shots is None else shots
+        unsettled = sum(not getattr(self.pairs[k][0], "settles", True) for k in candidate.effects)
+        if unsettled:
+            every = dataclasses.replace(every, spread=jnp.concatenate([every.spread, jnp.ones(unsettled)]))
         own = [self.each[i] for i in self.columns(candidate)]
         low, high = (jax.device_put(np.array([getattr(m, side) for m in own], float)) for side in "ab")
         axes: Any = (0, None, None)
@@ -249,16 +256,18 @@ class Bench:
         steps: int = 20,
         damping: float | Scalar = DAMPING,
     ) -> Fit:
-        """Fit a candidate from a point."""
+        """Fit a candidate from a point; what δ does not say of initial states is as it is taken to be."""
+        own = self.setup(candidate)
+        delta = jnp.pad(delta, ((0, 0), (0, own.spread.size - delta.shape[-1])))
         start, how = (x, delta, sigma, self.free(candidate)), {"steps": steps, "step": self.step, "damping": damping}
-        return solve(self.simulator(candidate), self.setup(candidate), *start, **how, live=self.used(candidate))
+        return solve(self.simulator(candidate), own, *start, **how, live=self.used(candidate))
 
     def replay(
         self, candidate: Candidate, x: Float[Array, " k"], shots: Shots, delta: Float[Array, " n"] | float = 0.0
     ) -> Float[np.ndarray, "windows rows obs"]:
         """Predictions of windows from their recorded initial states, or from beside them."""
-        still = jnp.broadcast_to(delta, (shots.y.shape[0], shots.spread.size))
         own = self.setup(candidate, shots)
+        still = jnp.broadcast_to(delta, (shots.y.shape[0], own.spread.size))
         return np.asarray(_replay(self.simulator(candidate), own, np.asarray(x)[: self.used(candidate)], still))
 
     def scatter(

@@ -15,6 +15,8 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from bayessim_jax.effects import Moment
+from bayessim_jax.effects.contract import Past
+from bayessim_jax.effects.forces import recorded_steps
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS
 from bayessim_jax.programs import trace_once
 
@@ -92,7 +94,8 @@ def force_of(
                 positions, velocities, drives = earlier
                 start = moment(*first)
                 motion = jnp.append(positions, start.position), jnp.append(velocities, start.velocity)
-                begun = effect.recall(values, begun, *motion, drives, period)
+                recorded = recorded_steps(start.time, len(drives), period)
+                begun = effect.recall(values, begun, Past(*motion, drives, recorded, period, h))
             if not jax.tree.leaves(begun):
                 return jax.vmap(lambda now: once(begun, now)[1])(rows).reshape(-1, steps).mean(-1)
             return jax.lax.scan(once, begun, rows)[1].reshape(-1, steps).mean(-1)

@@ -356,9 +356,13 @@ def _remembered(bench: Bench, shots: Shots) -> Bool[np.ndarray, " windows"] | No
     return there if there.mean() > ENOUGH else None
 
 
-def _recalls(bench: Bench, candidate: Candidate) -> bool:
-    """Whether what a joint's motion has left in an effect when a recording begins matters, and is not known."""
-    return any(getattr(bench.pairs[k][0], "recalls", False) for k in candidate.effects)
+def _recalls(bench: Bench, candidate: Candidate, but_found: bool = False) -> bool:
+    """Whether what a joint's motion has left in an effect when a recording begins matters, and is not known.
+
+    `but_found`: nor found by fits.
+    """
+    effects = [bench.pairs[k][0] for k in candidate.effects]
+    return any(getattr(e, "recalls", False) and (e.settles or not but_found) for e in effects)
 
 
 def _each(screens: Sequence[Screen], items: Sequence[T], do: Callable[[Screen, T], R]) -> list[R]:
@@ -650,14 +654,14 @@ def _folds(group: Int[np.ndarray, " windows"]) -> Bool[Array, "folds windows"]:
 
 def _enter(work: _Work, candidate: Candidate, fit: Fit, known: Float[np.ndarray, "..."] | float = 0.0) -> Entry:
     """Score a candidate on windows that fits have not seen, recording by recording or in as many folds."""
-    bench, spread = work.bench, work.bench.shots.spread
+    bench, spread = work.bench, work.bench.setup(candidate).spread
     measured = bench.shots.measured
     scores = cross_validate(
         fit.r, fit.slopes, measured, fit.z, bench.free(candidate), fit.sigma, work.floor, work.folds, fit.delta / spread
     )
     scores = np.nan_to_num(np.asarray(scores), nan=-1e12)
     misfit_key = jax.random.fold_in(work.key, crc32(" ".join(map(bench.label, candidate.effects)).encode()))
-    judged = work.remembered if _recalls(bench, candidate) else None
+    judged = work.remembered if _recalls(bench, candidate, but_found=True) else None
     misfit = judge_misfit(misfit_key, fit.misses, fit.along_states, np.asarray(measured), known, judged)
     share, seats = _log_share(bench, candidate, fit), bench.seats(candidate)
     told = bench.told(candidate, fit.z)

@@ -107,12 +107,14 @@ class AugmentedMjcf:
         time: Scalar | float = 0.0,
         past: Actions | None = None,
         motion: tuple[Float[Array, "periods nq"], Float[Array, "periods nv"]] | None = None,
+        moves: Float[Array, " m"] | None = None,
     ) -> AugmentedState:
         """The state with these measured positions and velocities, `time` seconds into a recording.
 
         `action` is the command of the first control period, without it zero; `past` are those before it, one row for
         each control period, the most recent last, without them as if the first had always been held. `motion` are
-        positions and velocities of as many control periods, for effects that remember how a joint has moved.
+        positions and velocities of as many control periods, for effects that remember how a joint has moved. `moves`
+        are how far the effects that do not settle had moved from what they are taken to remember before that.
         """
         kind = jnp.result_type(theta)
         qpos, qvel = (jnp.asarray(x, kind) for x in (qpos, qvel))
@@ -123,7 +125,7 @@ class AugmentedMjcf:
         bent = [w for _, w in sensors(rig) if not w.effect.remembers]
         still = jnp.zeros_like(qvel)
         qpos, qvel = restore(rig, bent, theta, names, qpos, qvel, time, still, still)
-        start = partial(self._start, theta, action=first, time=time, past=past, motion=motion)
+        start = partial(self._start, theta, action=first, time=time, past=past, motion=motion, moves=moves)
         if not late:
             return start(qpos, qvel)
         curve = self._curve(theta, begin_late(rig, theta, start(qpos, qvel), still, still), first)
@@ -139,6 +141,7 @@ class AugmentedMjcf:
         time: Scalar,
         past: Actions | None,
         motion: tuple[Float[Array, "periods nq"], Float[Array, "periods nv"]] | None,
+        moves: Float[Array, " m"] | None,
     ) -> AugmentedState:
         """The state with these true positions and velocities."""
         kind, rig = jnp.result_type(theta), self._rig
@@ -159,7 +162,7 @@ class AugmentedMjcf:
         if motion is None or not len(motion[0]):
             return state
         commanded = jnp.broadcast_to(action, (len(motion[0]), action.size)) if past is None else jnp.asarray(past, kind)
-        return recall_motion(rig, theta, numbers, state, *motion, commanded)
+        return recall_motion(rig, theta, numbers, state, *motion, commanded, moves)
 
     def restart(self, theta: Float[Array, " d"], observation: Float[Array, " obs"]) -> AugmentedState:
         """The state that shows this observation, as if nothing had been commanded for long.

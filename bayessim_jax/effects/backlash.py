@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array
 
-from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Scales, Values
+from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Past, Scales, Values
 from bayessim_jax.effects.places import driving_actuators
 
 __all__ = ["Backlash"]
@@ -47,13 +47,12 @@ class Backlash(ForceEffect):
         load = _rigid(values, moment)
         return moment.position + 0.5 * values["gap"] * jnp.sign(load), moment.velocity
 
-    def recall(
-        self, values: Values, memory: Memory, positions: Array, velocities: Array, drives: Array, h: float
-    ) -> Memory:
+    def recall(self, values: Values, memory: Memory, past: Past, move: Number = 0.0) -> Memory:
         """θ and θ̇ of a motor within a gap that moves as recorded, on cubics between the rows.
 
         It begins at the end to which the drive presses it; from the first time that it meshes this no longer matters.
         """
+        positions, velocities, drives, h = past.positions, past.velocities, past.drives, past.period
         rotor, half, step = jnp.maximum(values["rotor_inertia"], TINY), 0.5 * values["gap"], h / PARTS
         late = jnp.arange(1, PARTS + 1) / PARTS
 

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import mujoco
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Float
 
 from bayessim_jax.contracts import Scalar
 
@@ -34,6 +34,7 @@ __all__ = [
     "Moment",
     "Number",
     "Numbers",
+    "Past",
     "Scales",
     "SenseEffect",
     "Values",
@@ -178,6 +179,21 @@ class Moment(NamedTuple):
         return self.inertia * (self.velocity / self.h + self.acceleration)
 
 
+class Past(NamedTuple):
+    """How a joint moved before a simulation begins, in steps of `period` s."""
+
+    positions: Float[Array, " steps_and_one"]
+    """At both ends of every step, m or rad; the last is that of the state in which the simulation begins."""
+    velocities: Float[Array, " steps_and_one"]
+    drives: Float[Array, " steps"]
+    """What actuators exerted on the joint during every step, N or N m."""
+    recorded: Bool[Array, " steps"]
+    """Which steps were recorded; in those before a recording the joint is taken to coast."""
+    period: float
+    h: float = 0.0
+    """s, the time step of the simulation, in which a memory is that of one step ago."""
+
+
 @runtime_checkable
 class Effect(Protocol):
     """What is common to the effects at all ports."""
@@ -248,25 +264,25 @@ class ForceEffect(Effect, Protocol):
 
     recalls: bool = False
     """Whether it remembers what happened long before; otherwise the state that it begins in says enough."""
+    settles: bool = True
+    """Whether the state says what it remembers when a recording begins; otherwise fits find it window by window."""
 
     def begin(self, values: Values, moment: Moment) -> Memory:
         """The memory with which a simulation begins in this state, as if it had lasted."""
         return ()
 
-    def recall(
-        self, values: Values, memory: Memory, positions: Array, velocities: Array, drives: Array, h: float
-    ) -> Memory:
-        """The memory after a joint has moved so under what actuators exerted on it, in steps of h s.
+    def recall(self, values: Values, memory: Memory, past: Past, move: Number = 0.0) -> Memory:
+        """The memory after a joint has moved so, into a state that it would begin in with this memory.
 
-        Positions and velocities are those at both ends of every step, one more than drives; the last are those of the
-        state in which a simulation begins.
+        An effect that does not settle remembers a best guess before that where `move` is 0, and is N(0, 1) a priori.
         """
 
         def once(memory: Memory, now: tuple[Array, Array, Array]) -> tuple[Memory, None]:
             position, velocity, drive = now
-            return self.force(values, memory, Moment(jnp.zeros(()), h, position, velocity, drive=drive))[1], None
+            moment = Moment(jnp.zeros(()), past.period, position, velocity, drive=drive)
+            return self.force(values, memory, moment)[1], None
 
-        return jax.lax.scan(once, memory, (positions[:-1], velocities[:-1], drives))[0]
+        return jax.lax.scan(once, memory, (past.positions[:-1], past.velocities[:-1], past.drives))[0]
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
         """The force during the time step, N or N m, and the memory for the next one."""

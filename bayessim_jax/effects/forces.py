@@ -7,13 +7,14 @@ from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from bayessim_jax.effects.contract import Number, Numbers
+from bayessim_jax.contracts import Scalar
+from bayessim_jax.effects.contract import Number, Numbers, Past
 from bayessim_jax.effects.drive import CAUTION, actuators_of, drive_of
 from bayessim_jax.effects.rig import AugmentedState, Grip, Rig, as_arrays
 
-__all__ = ["add_forces", "begin_joints", "recall_motion"]
+__all__ = ["add_forces", "begin_joints", "recall_motion", "recorded_steps"]
 
 
 def add_forces(
@@ -86,9 +87,15 @@ def recall_motion(
     qpos: Float[Array, "periods nq"],
     qvel: Float[Array, "periods nv"],
     ctrl: Float[Array, "periods act"],
+    moves: Float[Array, " m"] | None = None,
 ) -> AugmentedState:
-    """The memories of effects that remember how their joint has moved, and under which commands."""
+    """The memories of effects that remember how their joint has moved, and under which commands.
+
+    `moves` are how far the effects that do not settle, one after the other, were from the best guess before that.
+    """
     recalled, physics = {}, state.base.physics
+    unsettled = [k for k, w in rig.at("force") if not w.effect.settles]
+    recorded = recorded_steps(state.time, len(qpos), rig.dt)
     for k, w in rig.at("force"):
         if w.effect.recalls:
             q, v = rig.address(w.site.joint)
@@ -97,8 +104,15 @@ def recall_motion(
             drives = drive + jnp.zeros_like(position)
             position = jnp.append(position, rig.engine.qpos(physics)[q])
             velocity = jnp.append(velocity, rig.engine.qvel(physics)[v])
-            recalled[k] = w.effect.recall(w.values(theta), state.memories[k], position, velocity, drives, rig.dt)
+            move = moves[unsettled.index(k)] if moves is not None and k in unsettled else 0.0
+            past = Past(position, velocity, drives, recorded, rig.dt, rig.h)
+            recalled[k] = w.effect.recall(w.values(theta), state.memories[k], past, move)
     return state.with_memories(recalled)
+
+
+def recorded_steps(time: Scalar, count: int, period: float) -> Bool[Array, " count"]:
+    """Which of so many steps before a time, s since the beginning of a recording, are in it."""
+    return time - period * jnp.arange(count, 0, -1) > -0.5 * period
 
 
 def _accelerations(rig: Rig, state: AugmentedState) -> dict[int, Number]:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import mujoco
+from jaxtyping import Array
 
-from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Scales, Values
+from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Past, Scales, Values
 from bayessim_jax.effects.places import joints
 
 __all__ = ["Hysteresis"]
 
 TINY = 1e-12
+BENT = 0.9
+"""Of what a spring can be bent by lasting motion: as much as it is taken to be when a recording begins, at most."""
 
 
 class Hysteresis(ForceEffect):
@@ -26,6 +30,7 @@ class Hysteresis(ForceEffect):
     name = "hysteresis"
     holds = True
     recalls = True
+    settles = False
 
     def places(self, model: mujoco.MjModel) -> list[str]:
         """Every hinge and slide."""
@@ -45,10 +50,29 @@ class Hysteresis(ForceEffect):
 
     def begin(self, values: Values, moment: Moment) -> Memory:
         """As far as lasting motion takes it, or as what it holds."""
-        most = (values["A"] / jnp.maximum(values["beta"] + values["gamma"], 1e-3 * values["beta"])) ** (
-            1.0 / values["n"]
-        )
+        most = _most(values)
         return jnp.clip(moment.stop / (values["stiffness"] + TINY), -most, most)
+
+    def recall(self, values: Values, memory: Memory, past: Past, move: Number = 0.0) -> Memory:
+        """As far as a path that was recorded bends it, ∂z/∂q = A − (β sign(ż) sign(z) + γ) |z|ⁿ, by the midpoint rule.
+
+        What it was bent before is a guess: as much as now if nothing has moved since, and less the longer the path is.
+        A machine may be let go in any state, and a spring be bent since long before.
+        """
+        mean = 0.5 * (past.velocities[1:] + past.velocities[:-1])
+        moved = jnp.where(past.recorded, past.period * mean, 0.0).at[-1:].multiply(1.0 - past.h / past.period)
+        most = _most(values)
+        guess = BENT * memory / most * jnp.exp(-values["A"] * jnp.abs(moved).sum() / most)
+
+        def bend(z: Array, dq: Array) -> Array:
+            size = jnp.abs(z) + TINY
+            return dq * (values["A"] - (values["beta"] * jnp.sign(dq * z) + values["gamma"]) * size ** values["n"])
+
+        def once(z: Array, dq: Array) -> tuple[Array, None]:
+            middle = jnp.clip(z + 0.5 * bend(z, dq), -most, most)
+            return jnp.clip(z + bend(middle, dq), -most, most), None
+
+        return jax.lax.scan(once, most * jnp.tanh(jnp.arctanh(guess) + move), moved)[0]
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
         """What it exerts at the end of the time step."""
@@ -61,3 +85,7 @@ class Hysteresis(ForceEffect):
         coasting = v + h * moment.acceleration
         k = values["stiffness"] * share
         return -k * (bent + rise * coasting) / (1.0 + k * rise * h / m), bent
+
+
+def _most(values: Values) -> Number:
+    return (values["A"] / jnp.maximum(values["beta"] + values["gamma"], 1e-3 * values["beta"])) ** (1.0 / values["n"])

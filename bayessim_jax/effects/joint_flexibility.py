@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
 
-from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Scales, Values
+from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Past, Scales, Values
 from bayessim_jax.effects.places import driven_joints
 
 __all__ = ["JointFlexibility"]
@@ -62,13 +62,12 @@ class JointFlexibility(ForceEffect):
         bend = (moment.drive - share * moment.inertia * moment.acceleration) / values["stiffness"]
         return moment.position + bend, moment.velocity
 
-    def recall(
-        self, values: Values, memory: Memory, positions: Array, velocities: Array, drives: Array, h: float
-    ) -> Memory:
+    def recall(self, values: Values, memory: Memory, past: Past, move: Number = 0.0) -> Memory:
         """θ and θ̇ of a rotor that rings while the link moves as recorded: J θ̈ + d θ̇ + k θ = τ_m + k q + d q̇.
 
         Exact for forces that are constant over a step. It begins with the acceleration of the first rows.
         """
+        positions, velocities, drives, h = past.positions, past.velocities, past.drives, past.period
         k, d = values["stiffness"], values["damping"]
         rotor = jnp.maximum(values["rotor_inertia"], TINY * k * h**2)
         x = jnp.arange(min(len(velocities), SLOPE)) * h

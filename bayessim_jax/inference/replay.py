@@ -100,19 +100,21 @@ def replay_window(system: Any, theta: Array, delta: Float[Array, " n"], window: 
     """What the sensors show in every row of a window that begins δ beside the recorded state.
 
     `system` is an `MjcfSystem` or `Restarted`, or one of them with effects. Observations of a restarted one stand under
-    `qpos`; what follows these in δ is added to commands from before the recording.
+    `qpos`; what follows these in δ is added to commands from before the recording. What follows positions and
+    velocities in that of a model with effects moves what these are taken to remember.
     """
     if isinstance(system, (Restarted, AugmentedSystem)):
         return _replay_restarted(system, theta, delta, window)
     nv = system.engine.model.nv
-    qpos, qvel = displace(system.engine.model, window.qpos, delta[:nv]), window.qvel + delta[nv:]
+    qpos, qvel = displace(system.engine.model, window.qpos, delta[:nv]), window.qvel + delta[nv : 2 * nv]
     commanded = window.ctrl.shape[-1] > 0
     if isinstance(system, MjcfSystem):
         state = system.begin(theta, qpos, qvel)
         state = dataclasses.replace(state, ctrl=window.ctrl[0]) if commanded else state
     else:
         past = window.past if commanded and window.past.shape[0] else None
-        state = system.begin(theta, qpos, qvel, window.ctrl[0] if commanded else None, window.time, past, window.motion)
+        first, moves = window.ctrl[0] if commanded else None, delta[2 * nv :] if delta.size > 2 * nv else None
+        state = system.begin(theta, qpos, qvel, first, window.time, past, window.motion, moves)
     first = system.observe(theta, state)
     after = jax.vmap(system.observe, in_axes=(None, 0))(theta, system.replay(theta, state, window.ctrl))
     return jnp.concatenate([first[None], after])

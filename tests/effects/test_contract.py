@@ -313,18 +313,22 @@ def test_a_long_past_is_gone_through_in_few_steps():
     assert abs(float(short.memories[1]) - wanted) > 0.15
 
 
-def test_a_bent_joint_remembers_how_it_has_moved():
+@pytest.mark.parametrize(("yields", "move", "tolerance"), [(0.05, 0.0, 0.15), (0.5, -3.0, 0.01)])
+def test_a_bent_joint_remembers_how_it_has_moved(yields, move, tolerance):
+    """Whatever it was before, where it yields soon; where it does not, what it was before is asked for."""
     base = system(*MODELS["pendulum"])
-    augmented = with_effects(base, [(EFFECTS["hysteresis"], "joint/hinge")], Scales(position=10.0))
+    augmented = with_effects(base, [(EFFECTS["hysteresis"], "joint/hinge")], Scales(position=20.0 * yields))
     theta, actions = start_of(augmented), jnp.asarray(chirp(80, force=0.5), float)
-    states = augmented.replay(theta, augmented.begin(theta, jnp.array([0.3]), jnp.zeros(1), actions[0]), actions)
-    middle = jax.tree.map(lambda x: x[59], states)
+    begun = augmented.begin(theta, jnp.array([0.3]), jnp.zeros(1), actions[0])
+    states = augmented.replay(theta, begun, actions)
+    states = jax.tree.map(lambda first, after: jnp.concatenate([first[None], after]), begun, states)
+    middle = jax.tree.map(lambda x: x[60], states)
     motion = tuple(jax.vmap(read)(states)[:60] for read in (augmented.positions, augmented.velocities))
     where = (augmented.positions(middle), augmented.velocities(middle), actions[60])
-    with_motion, without = (augmented.begin(theta, *where, time=0.6, motion=m) for m in (motion, None))
+    moved = augmented.begin(theta, *where, time=0.6, motion=motion, moves=jnp.array([move]))
     bent = float(middle.memories[0])
-    assert float(with_motion.memories[0]) == pytest.approx(bent, rel=0.05)
-    assert float(without.memories[0]) != pytest.approx(bent, rel=0.3)
+    assert float(moved.memories[0]) == pytest.approx(bent, rel=tolerance)
+    assert float(augmented.begin(theta, *where, time=0.6).memories[0]) != pytest.approx(bent, rel=0.3)
 
 
 def test_what_a_system_lacks_is_told():

@@ -8,6 +8,7 @@ import pytest
 import scipy.linalg
 
 from bayessim_jax.effects import EFFECTS, Scales, with_effects, write_mjcf
+from bayessim_jax.effects.contract import Past
 from bayessim_jax.effects.mjcf_edits import WRITERS
 from bayessim_jax.systems.mjcf import mjcf_system
 from tests.effects.benches import arm, cart, chirp, pendulum, run, simulate, system
@@ -27,6 +28,12 @@ def ride(effects, values, actions, q=0.0, v=0.0, timestep=0.002, gravity="0 0 -9
     base = system(cart(timestep, gravity), "cart")
     seen = run(base, effects, values, np.asarray(actions), q, v, MASS, **begin)
     return np.asarray(seen[:, 0]), np.asarray(seen[:, 1])
+
+
+def past(h, positions, velocities, drives):
+    """How a joint moved, all of it recorded."""
+    moved = map(jnp.asarray, (positions, velocities, drives))
+    return Past(*moved, recorded=jnp.ones(len(drives), bool), period=h)
 
 
 def push(force, steps=300):
@@ -140,9 +147,7 @@ def test_a_rotor_is_recalled_as_it_rang(k, d, rotor):
             rest = 0.1 * np.sin(5.0 * now) + (drive[i] + d * 0.5 * np.cos(5.0 * now)) / k
             angle, speed = np.array([rest, 0.0]) + ahead @ (np.array([angle, speed]) - np.array([rest, 0.0]))
     values = {"stiffness": k, "damping": d, "rotor_inertia": rotor}
-    recalled = EFFECTS["joint_flexibility"].recall(
-        values, (0.0, 0.0), *map(jnp.asarray, (position, velocity, drive)), h
-    )
+    recalled = EFFECTS["joint_flexibility"].recall(values, (0.0, 0.0), past(h, position, velocity, drive))
     assert float(recalled[0]) == pytest.approx(angle, abs=0.02 * np.ptp(position))
     bend, wanted = float(recalled[0]) - position[-1], angle - position[-1]
     assert bend == pytest.approx(wanted, abs=0.15 * abs(wanted) + 1e-4)
@@ -280,8 +285,39 @@ def test_bristles_are_recalled_as_they_bent(moved):
     back = round(moved * level / stiffness / (0.1 * h))
     velocities = jnp.concatenate([jnp.full(3000, 0.1), jnp.full(back + 1, -0.1)])
     still = jnp.zeros_like(velocities)
-    bent = EFFECTS["lugre_friction"].recall(values, jnp.zeros(()), still, velocities, still[1:], h)
+    bent = EFFECTS["lugre_friction"].recall(values, jnp.zeros(()), past(h, still, velocities, still[1:]))
     assert float(bent) == pytest.approx(-level + 2 * level * np.exp(-moved), abs=0.01 * level)
+
+
+@pytest.mark.parametrize("back", [0.05, 0.25, 0.6])
+def test_a_spring_that_yields_is_recalled_as_it_was_bent(back):
+    """After lasting motion one way, and a way x back: z = 1/(2β) − x as far as 0, and (exp(−2β x') − 1)/(2β) beyond."""
+    beta, h, speed = 2.0, 0.01, 0.5
+    velocities = jnp.concatenate([jnp.full(600, speed), jnp.full(round(back / (speed * h)), -speed)])
+    velocities = jnp.append(velocities, -speed)
+    still = jnp.zeros_like(velocities)
+    values = {"stiffness": 3.0, "A": 1.0, "beta": beta, "gamma": beta, "n": 1.0}
+    most = 0.5 / beta
+    beyond = max(back - most, 0.0)
+    wanted = most - back if back < most else most * np.expm1(-beyond / most)
+    for move in (-1.0, 0.0, 1.0):
+        bent = EFFECTS["hysteresis"].recall(values, jnp.zeros(()), past(h, still, velocities, still[1:]), move)
+        assert float(bent) == pytest.approx(wanted, abs=0.02 * most)
+
+
+def test_what_a_spring_was_bent_before_a_recording_is_left_open():
+    """What was not recorded bends nothing; rest leaves all as it is, up to `move`; a path leaves less of a guess."""
+    values = {"stiffness": 3.0, "A": 1.0, "beta": 2.0, "gamma": 2.0, "n": 1.0}
+    most, still = 0.25, jnp.zeros(101)
+    recall = EFFECTS["hysteresis"].recall
+    coasted = past(0.01, still, still + 0.5, still[1:])._replace(recorded=jnp.zeros(100, bool))
+    for before in (coasted, past(0.01, still, still, still[1:])):
+        assert float(recall(values, 0.4 * most, before)) == pytest.approx(0.36 * most)
+        assert float(recall(values, 0.4 * most, before, 9.0)) == pytest.approx(most, rel=1e-3)
+        assert float(recall(values, 0.4 * most, before, -9.0)) == pytest.approx(-most, rel=1e-3)
+    there_and_back = past(0.01, still, 0.02 * jnp.where(jnp.arange(101) < 50, 1.0, -1.0), still[1:])
+    bent = float(recall(values, 0.4 * most, there_and_back))
+    assert 0.2 * most < bent < 0.36 * most
 
 
 @pytest.mark.parametrize("rows", [150, 158, 165, 180, 201])
@@ -302,9 +338,9 @@ def test_a_motor_is_recalled_where_it_was_within_its_gap(rows):
                 angle, speed = q + 0.5 * gap * end, end * min(end * speed, end * v)
         where.append((angle - q) / gap)
     assert min(where) < -0.499 and max(where) > 0.499 and np.mean(np.abs(where) < 0.4) > 0.1
-    motion = map(jnp.asarray, (0.1 * np.sin(5.0 * t), 0.5 * np.cos(5.0 * t), drive))
     values = {"gap": gap, "rotor_inertia": rotor}
-    recalled = EFFECTS["backlash"].recall(values, (0.0, 0.0), *motion, h)
+    motion = past(h, 0.1 * np.sin(5.0 * t), 0.5 * np.cos(5.0 * t), drive)
+    recalled = EFFECTS["backlash"].recall(values, (0.0, 0.0), motion)
     assert float(recalled[0]) == pytest.approx(angle, abs=0.01 * gap)
     assert float(recalled[1]) == pytest.approx(speed, abs=0.02)
 

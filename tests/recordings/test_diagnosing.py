@@ -129,6 +129,27 @@ def test_what_is_found_beside_another_effect_is_tried_by_itself(folder):
 
 
 @pytest.mark.slow
+def test_a_spring_with_hysteresis_is_named_however_it_was_bent_before(folder):
+    """A rod that is let go in mid-swing: how far it is bent then does not follow from its state."""
+    make_case(folder / "bent", "swing", "hysteresis", strength=0.409, velocities=False, finer=4, seed=5500100)
+    assert main(["diagnose", str(folder / "bent"), "--out", str(folder / "bent-run"), "--quiet"]) == 0
+    table = json.loads((folder / "bent-run" / "diagnosis.json").read_text())
+    assert [e["effect"] for e in table["effects"]] == ["hysteresis"]
+
+
+@pytest.mark.slow
+def test_gains_that_the_masses_trade_for_each_other_are_both_told(folder):
+    """One motor's gain is as good as the other's where all masses are unknown."""
+    make_case(folder / "gain", "double", "actuator_gain", strength=0.296, velocities=False, finer=4, seed=5600098)
+    assert main(["diagnose", str(folder / "gain"), "--out", str(folder / "gain-run"), "--quiet"]) == 0
+    table = json.loads((folder / "gain-run" / "diagnosis.json").read_text())
+    assert {tuple(names) for names in table["confusion_set"]} == {
+        ("actuator_gain@actuator/m1",),
+        ("actuator_gain@actuator/m2",),
+    }
+
+
+@pytest.mark.slow
 def test_a_tilt_is_the_same_as_an_offset_however_large(folder):
     settings = {"strength": 0.539, "noise": 0.3, "quantize": 2048, "jitter": 0.3, "finer": 4, "seed": 5300049}
     sealed = make_case(folder / "tilt", "swing", "base_tilt", **settings)
