@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 
 from bayessim_jax.diagnosis.bench import Bench, Candidate
 from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, Misfit
+from bayessim_jax.inference.scores import Errors
 from bayessim_jax.inference.shooting import Fit, Shots
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "error_left",
     "explains",
     "has_special_case",
+    "is_outdone",
     "is_worth",
     "may_be_named",
     "share_left",
@@ -94,6 +96,8 @@ class Thresholds:
     """Share of what the best candidate gains by which others may be worse and tie, where it is not wholly right."""
     least: float = 4.0
     """Nats in all by which a candidate has to be worse to be out of the confusion set."""
+    ceiling: float = 0.9
+    """Share of what a force without a name gains on recordings left out that an answer has to gain there."""
     coincidence: float = 5.0
     """Nats by which its numbers may be a greater coincidence than another's that does as well."""
 
@@ -150,6 +154,12 @@ class Diagnosis:
     """Of every set in the confusion set."""
     screened: list[tuple[str, float]] = field(default_factory=list)
     """Every candidate and how much it gained on the windows it was fitted to."""
+    outdone: bool = False
+    """Whether an answer was taken back because a force without a name predicts recordings left out far better."""
+
+    def take_back(self) -> None:
+        """Leave the misfit unexplained by what had been found."""
+        self.verdict, self.outdone, self.confusion, self.probabilities = "unexplained", True, [], []
 
     @property
     def best(self) -> Entry:
@@ -254,6 +264,29 @@ def explains(entry: Entry, none: Entry, thresholds: Thresholds) -> bool:
     if foreseen or (entry.misfit.p_value >= FALSE_ALARMS and not left * entry.ahead > thresholds.most):
         return True
     return left <= thresholds.left and not (entry.ahead > thresholds.ahead or left * entry.ahead > both)
+
+
+def is_outdone(
+    baseline: Errors, answer: Errors, flexible: Errors, scale: Float[np.ndarray, " obs"], thresholds: Thresholds
+) -> bool:
+    """Whether a force without a name gains much more than an answer in predictions of recordings left out.
+
+    Beyond what chance makes of it: by two standard errors of the windows' mean squares, in units of `scale`.
+    """
+    every = (baseline, answer, flexible)
+    there = np.all([errors.measured.any((1, 2)) for errors in every], axis=0)
+    if there.sum() < 2:
+        return False
+
+    def squares(errors: Errors) -> Float[np.ndarray, " windows"]:
+        counts = errors.measured[there].sum((1, 2))
+        return ((errors.error[there] / scale) ** 2).sum((1, 2)) / counts
+
+    without, named, free = map(squares, every)
+    more = named - free
+    sure = more.mean() > 2.0 * more.std(ddof=1) / np.sqrt(len(more))
+    was, now, best = (np.sqrt(each.mean()) for each in (without, named, free))
+    return bool(sure and was - now < thresholds.ceiling * (was - best))
 
 
 def _suffices(entry: Entry, tied: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:

@@ -23,7 +23,7 @@ from bayessim_jax.diagnosis.procedure import Problem, detect, is_mismatch, name_
 from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.diagnosis.screen import Screened
 from bayessim_jax.diagnosis.simulated_scene import SimulatedScene
-from bayessim_jax.diagnosis.verdict import Diagnosis, Entry, Thresholds, share_left
+from bayessim_jax.diagnosis.verdict import Diagnosis, Entry, Thresholds, is_outdone, share_left
 from bayessim_jax.effects import EFFECTS, Scales, commanded_scales, effect_places, recorded_scales
 from bayessim_jax.inference.replay import Restarted
 from bayessim_jax.inference.scores import Score, compare, error_spread, score
@@ -287,12 +287,16 @@ def diagnose_case(
     predictions = {which: bench.replay(entry.candidate, entry.fit.z, shots) for which, entry in entries.items()}
     if residual is not None:
         predictions["flexible"] = residual.bench.replay(residual.found.candidate, residual.found.p, shots)
-    scores, spreads = {}, {}
+    scores, spreads, judging = {}, {}, {}
     y, measured = np.asarray(shots.y), np.asarray(shots.measured)
     for which, predicted in predictions.items():
         spreads[which] = error_spread(compare(predicted[chosen], y[chosen], measured[chosen]), scale)
-        judged = compare(predicted[~chosen], y[~chosen], measured[~chosen])
-        scores[which] = score(judged, spreads[which], scale, bench.channels)
+        judging[which] = compare(predicted[~chosen], y[~chosen], measured[~chosen])
+        scores[which] = score(judging[which], spreads[which], scale, bench.channels)
+    if result.confusion and "flexible" in judging:
+        before, answer, free = (judging[which] for which in ("baseline", "augmented", "flexible"))
+        if is_outdone(before, answer, free, scale, thresholds or Thresholds()):
+            result.take_back()
     named = result.verdict != "no_mismatch"
     return CaseDiagnosis(
         model=model,

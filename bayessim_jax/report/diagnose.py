@@ -46,7 +46,13 @@ def headline(diagnosis: CaseDiagnosis) -> str:
         if result.entries:
             best = result.entries[0]
             left = number(100 * share_left(best.misfit, result.baseline.misfit))
-            sentence += f" The closest, {best.title}, leaves {left} % of the misfit."
+            sentence += f" The closest, {best.title}, leaves {left} % of the misfit"
+            flexible = diagnosis.scores["flexible"].nrmse if result.outdone else 0.0
+            beyond = (
+                f", but a force without a name predicts better: {held} it misses by {number(100 * flexible)} % of a"
+            )
+            beyond += f" channel's spread, and the candidate by {number(100 * after)} %."
+            sentence += beyond if result.outdone else "."
         return sentence
     change = f"{held} miss by {number(100 * after)} % of a channel's spread instead of {number(100 * before)} %"
     if result.verdict == "ambiguous":

@@ -5,8 +5,9 @@ import pytest
 
 from bayessim_jax.diagnosis.bench import Candidate
 from bayessim_jax.diagnosis.procedure import _is_too_narrow
-from bayessim_jax.diagnosis.verdict import Entry, Thresholds, are_kin, decide, error_left, may_be_named
+from bayessim_jax.diagnosis.verdict import Entry, Thresholds, are_kin, decide, error_left, is_outdone, may_be_named
 from bayessim_jax.diagnosis.whiteness import Misfit
+from bayessim_jax.inference.scores import Errors
 from bayessim_jax.inference.shooting import Shots
 
 WINDOWS = 30
@@ -34,6 +35,28 @@ def test_one_candidate_that_explains_is_named():
     assert found.verdict == "explained"
     assert found.best.names == ["a@x"]
     assert 0.9 < found.probabilities[0] < 1.0
+
+
+@pytest.mark.parametrize(
+    ("answer", "flexible", "wanted"),
+    [
+        (0.5, 0.1, True),  # gains 5 of 9
+        (0.15, 0.1, False),  # nearly as good
+        (0.1, 0.5, False),  # better
+        (1.3, 1.1, True),  # both worse than nothing, the answer more so
+        (0.98, 0.96, False),  # not to be told apart
+    ],
+)
+def test_an_answer_that_a_force_without_a_name_outdoes_is_taken_back(answer, flexible, wanted):
+    rng, measured = np.random.default_rng(0), np.ones((WINDOWS, 20, 2), bool)
+    scale = np.array([2.0, 0.1])
+    errors = [Errors(size * scale * rng.normal(size=measured.shape), measured) for size in (1.0, answer, flexible)]
+    assert is_outdone(*errors, scale, Thresholds()) == wanted
+    lost = Errors(np.full_like(errors[2].error, 0.0), np.zeros_like(measured), WINDOWS)
+    assert not is_outdone(*errors[:2], lost, scale, Thresholds())
+    found = verdict(entry(["a@x"], 100.0, 0.002), entry(["b@x"], 50.0, 0.4, seed=1))
+    found.take_back()
+    assert found.verdict == "unexplained" and found.best.names == ["a@x"] and found.confusion == []
 
 
 def test_candidates_that_predict_alike_are_a_confusion_set():
