@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from bayessim_jax.concealment import LAWS, UNKNOWN, StrengthError
-from bayessim_jax.recordings.concealing import AbsorbedError
+from bayessim_jax.recordings.concealing import NOTHING, AbsorbedError
 from benchmarks.compilation import make_room
 from benchmarks.worlds import MODELS, RIGS, make_case
 
@@ -293,8 +293,18 @@ def summarize(rows: list[dict[str, Any]]) -> str:
             parts.append(f"joint right {sum(located)} of {len(located)}")
         parts.append(f"library without abstention: wrong in {sum(_is_wrong(row) for row in members)}")
         lines.append(f"{group:<8} {len(members):>4}: {', '.join(parts)}")
-    for outcome, told, simulator in (("missed", "missed", "baseline"), ("part", "told in part", "augmented")):
-        alike = [row["nrmse"][simulator] < ABSORBED * row["noise_floor"] for row in rows if row["outcome"] == outcome]
+    missed = [row for row in rows if row["outcome"] == "missed"]
+    known = [row["sealed"]["lacks"]["with_best"] < NOTHING for row in missed if "lacks" in row["sealed"]]
+    if any(known):
+        lines.append(
+            f"of the {len(known)} missed, {sum(known)} are other values of what is unknown: with these the model lacks "
+            f"less than {NOTHING:.0%} of the forces"
+        )
+    # records from before that was measured say less
+    missed = [row for row in missed if "lacks" not in row["sealed"]]
+    part = [row for row in rows if row["outcome"] == "part"]
+    for members, told, simulator in ((missed, "missed", "baseline"), (part, "told in part", "augmented")):
+        alike = [row["nrmse"][simulator] < ABSORBED * row["noise_floor"] for row in members]
         if any(alike):
             lines.append(
                 f"of the {len(alike)} {told}, {sum(alike)} predict within a tenth of the noise without the rest"

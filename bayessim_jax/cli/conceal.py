@@ -61,12 +61,12 @@ def conceal(words: Sequence[str]) -> int:
     command = parse(Conceal, words, "bayessim conceal")
     if command.seed < 0:
         raise UsageError(f"seed is {command.seed}; give 0 or more.")
-    from bayessim_jax.recordings.concealing import SEALED
+    from bayessim_jax.recordings.concealing import NOTHING, SEALED
     from bayessim_jax.recordings.concealing import conceal as write
 
     one = len(command.strength) == 1
     try:
-        write(
+        sealed = write(
             command.out,
             command.model,
             command.effect,
@@ -86,5 +86,7 @@ def conceal(words: Sequence[str]) -> int:
     except ValueError as error:
         raise UsageError(str(error)) from error
     print(f"{command.out}: {command.recordings} recordings; what is concealed is in {command.out / SEALED}.")
+    if sealed["effects"] and sealed["lacks"]["with_best"] < NOTHING:
+        print("Note: other values of what is unknown make up for it; no diagnosis can find it in these motions.")
     print(f"bayessim diagnose {command.out}")
     return 0

@@ -25,8 +25,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Scene", "make_scene"]
 
-SAMPLES = 4000
-"""At most so many rows are looked at where forces are measured."""
+SAMPLES, FEW = 4000, 400
+"""At most so many rows are looked at where forces are measured, and where they are measured again and again."""
+
+LEAST = 1e-9
+"""N or N m; a joint on which less acts is moved by nothing."""
 
 Forces = Float[np.ndarray, "samples nv"]
 
@@ -91,7 +94,12 @@ class Scene:
         missing, applied, _ = _forces(self.model, tracks)
         rms = [np.sqrt(np.mean(x**2, axis=0)) for x in (missing, applied)]
         ratio = rms[0] / np.maximum(rms[1], 1e-12)
-        return float(ratio[spot.v] if spot.joint >= 0 else ratio[rms[1] > 1e-9].max(initial=0.0))
+        return float(ratio[spot.v] if spot.joint >= 0 else ratio[rms[1] > LEAST].max(initial=0.0))
+
+    def lack(self, model: mujoco.MjModel, tracks: Sequence[Track]) -> Forces:
+        """What a model with other parameters lacks, in units of the root mean square that acts on every joint."""
+        missing, applied, _ = _forces(model, tracks, FEW)
+        return missing / np.maximum(np.sqrt(np.mean(applied**2, axis=0)), LEAST)
 
     def _sizes(self, joint: int) -> dict[str, float]:
         q, v = int(self.model.jnt_qposadr[joint]), int(self.model.jnt_dofadr[joint])
@@ -132,14 +140,14 @@ def make_scene(
     return Scene(model, drive, tuple(motions), tuple(simulate(machine, (), drive, motion) for motion in motions))
 
 
-def _forces(model: mujoco.MjModel, tracks: Sequence[Track]) -> tuple[Forces, Forces, Forces]:
+def _forces(model: mujoco.MjModel, tracks: Sequence[Track], samples: int = SAMPLES) -> tuple[Forces, Forces, Forces]:
     """What the model lacks, what motors and gravity exert together, and the motors alone, from row to row.
 
     The first is M (v' − v̂')/Δt with v' the velocity at the next row and v̂' what the model makes of this one.
     """
     plain = build(model, ())
     data, mass = mujoco.MjData(plain), np.zeros((model.nv, model.nv))
-    every = max(1, sum(len(track.rows) for track in tracks) // SAMPLES)
+    every = max(1, sum(len(track.rows) for track in tracks) // samples)
     missing, applied, motors = [], [], []
     for track in tracks:
         qvel, h = _velocities(model, track), float(track.time[1] - track.time[0])

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
+from scipy.optimize import least_squares
 
 from bayessim_jax.concealment import KINDS, ModelLaw, RunawayError, choose_place, hide, lookup_law, make_scene
 from bayessim_jax.recordings.augment import write_values
@@ -23,14 +24,18 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
     from pathlib import Path
 
-    from bayessim_jax.concealment import Hidden, Track
+    from bayessim_jax.concealment import Hidden, Scene, Track
 
-__all__ = ["SEALED", "AbsorbedError", "conceal"]
+__all__ = ["NOTHING", "SEALED", "AbsorbedError", "conceal"]
 
 SEALED = "sealed.json"
 """The file of a case that says what is concealed in it; nothing that diagnoses reads it."""
 NOISE = {HINGE: 1e-3, SLIDE: 2e-4}
 """Standard deviation of the noise of positions, rad and m; of velocities ten times as much for a second."""
+TRIES = 20
+"""Steps, at most, in which the parameters are sought that make up for most of what is concealed."""
+NOTHING = 0.01
+"""Strength, below which what a model lacks is nothing."""
 MIDDLE = 0.7
 """Hidden parameters lie in this much of their prior, in the middle."""
 HEAD = """\
@@ -103,6 +108,7 @@ def conceal(
         hidden = [hide(scene, *one, seed) for one in zip(names, chosen, strengths, strict=True)]
         _check_hidden(spec, machine, hidden, truth)
         tracks = scene.play([h.law for h in hidden]) if hidden else scene.clean
+        lacks = _lacks(spec, priors, truth, scene, tracks) if hidden else {"with_truth": 0.0, "with_best": 0.0}
     except RunawayError as error:
         raise ValueError(f"{model.name}: {error}; choose other motions, or less strength.") from error
     taken: set[str] = set()
@@ -110,6 +116,7 @@ def conceal(
     sealed = {
         "schema": SCHEMA,
         "effects": [_describe(machine, h, asked) for h, asked in zip(hidden, strengths, strict=True)],
+        "lacks": lacks,
         "parameters": {labels[target]: value for target, value in truth.items()},
         "motions": motions,
         "noise": noise,
@@ -214,6 +221,36 @@ def _check_hidden(spec: Any, machine: Any, hidden: Sequence[Hidden], unknown: Co
                 f"effect {one.name!r} at {one.law.spot.place!r}: it only moves {told}, unknown in the case; "
                 "choose another place, or other parameters."
             )
+
+
+def _lacks(
+    spec: Any,
+    priors: dict[Target, tuple[float, float]],
+    truth: dict[Target, float],
+    scene: Scene,
+    tracks: Sequence[Track],
+) -> dict[str, float]:
+    """What the model lacks at the joint where it is most: with the true parameters, and with those that leave least.
+
+    As a ratio of forces, like a strength; the other parameters lie in their ranges. Where they leave nothing, no
+    recording of these motions tells the effect from other values of what is unknown.
+    """
+    low, high = np.array(list(priors.values())).reshape(-1, 2).T
+
+    def lack(share: np.ndarray) -> np.ndarray:
+        model = _machine(spec.copy(), dict(zip(priors, (low + share * (high - low)).tolist(), strict=True)))
+        return scene.lack(model, tracks)
+
+    def size(missing: np.ndarray) -> float:
+        return round(float(np.sqrt(np.mean(missing**2, axis=0)).max(initial=0.0)), 6)
+
+    begun = (np.array([truth[target] for target in priors]) - low) / (high - low)
+    found = (
+        least_squares(lambda share: lack(share).ravel(), begun, bounds=(0.0, 1.0), max_nfev=TRIES).x
+        if priors
+        else begun
+    )
+    return {"with_truth": size(lack(begun)), "with_best": size(lack(found))}
 
 
 def _are_alike(one: Any, other: Any) -> bool:

@@ -62,6 +62,19 @@ def test_what_only_moves_what_is_unknown_hides_nothing(tmp_path):
     assert any("it only moves body/rod/ipos/2" in each for each in told)
 
 
+@pytest.mark.parametrize(("effect", "told"), [("actuator_gain", True), ("viscous_friction", False)])
+def test_it_is_measured_what_the_unknown_makes_up_for(tmp_path, capsys, effect, told):
+    """Another mass is another gain of the only motor of a slide, and no friction."""
+    model = tmp_path / "model.xml"
+    model.write_text(RIGS["slide"].xml)
+    words = ["--effect", effect, "--strength", "0.2", "--recordings", "2", "--seconds", "1.5"]
+    assert main(["conceal", str(model), *words, "--out", str(tmp_path / "case")]) == 0
+    lacks = json.loads((tmp_path / "case" / SEALED).read_text())["lacks"]
+    assert lacks["with_truth"] == pytest.approx(0.2, rel=0.15)
+    assert lacks["with_best"] < 1e-3 if told else lacks["with_best"] > 0.1
+    assert ("other values of what is unknown make up for it" in capsys.readouterr().out) == told
+
+
 def test_the_label_is_sealed_and_never_read(tmp_path, model):
     folder = tmp_path / "case"
     sealed = conceal(folder, model, "coulomb_friction", at="joint/hinge", seed=4, **QUICK)
@@ -232,6 +245,9 @@ def test_the_scoreboard_counts_predictions_and_intervals():
     assert "90.0% (median)" in board and "worse than the baseline in 0" in board
     assert "100% of 1 with the effect, 0% without; median error 1.00% against 20.00%" in board
     assert "those of effects hold the world's in 100% of 1" in board
+    missed = {**row, "verdict": "no_mismatch", "effects": [], "locations": [], "closest": []}
+    missed["sealed"] = {**sealed, "lacks": {"with_truth": 0.2, "with_best": 0.001}}
+    assert "of the 1 missed, 1 are other values of what is unknown" in summarize([missed | judge(sealed, missed)])
     refused = {**row, "verdict": "unexplained", "effects": [], "closest": ["armature@joint/a"]}
     assert "refused 1, single best 0, joint right 1 of 1, library without abstention: wrong in 1" in summarize(
         [refused | judge(sealed, refused)]
