@@ -301,10 +301,15 @@ def _suffices(entry: Entry, tied: Sequence[Entry], none: Entry, thresholds: Thre
 
 
 def is_worth(entry: Entry, entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:
-    """Whether what a set adds to a part of it leaves much less: a little less is what any further effect leaves."""
+    """Whether what a set adds to a part of it leaves much less, and predicts windows better that fits have not seen.
+
+    A little less is what any further effect leaves.
+    """
     parts = [other for other in entries if set(other.names) < set(entry.names)]
     left = share_left(entry.misfit, none.misfit)
-    return all(left <= thresholds.worth * share_left(part.misfit, none.misfit) for part in parts)
+    return all(
+        left <= thresholds.worth * share_left(part.misfit, none.misfit) and entry.score >= part.score for part in parts
+    )
 
 
 def ties(entry: Entry, best: Entry, none: Entry, thresholds: Thresholds) -> bool:

@@ -20,7 +20,7 @@ class ActuatorSaturation(ActEffect):
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The limit u_max; a fit begins where some commands are above it."""
         u = scales.command
-        return (EffectParameter("limit", "", 0.01 * u, 1.2 * u, math.inf, 0.7 * u, form=0.01),)
+        return (EffectParameter("limit", "", 0.01 * u, 2.5 * u, math.inf, 0.7 * u, form=0.01),)
 
     def command(self, values: Values, memory: Memory, command: Any, moment: Moment) -> tuple[Any, Memory]:
         """The command within its limits."""
