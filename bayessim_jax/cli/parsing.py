@@ -38,7 +38,9 @@ def parse(schema: type[C], words: Sequence[str], prog: str, default: C | None = 
     told = io.StringIO()
     try:
         with contextlib.redirect_stderr(told):
-            parsed: Any = tyro.cli(schema, prog=prog, args=list(words), default=default)
+            parsed: Any = tyro.cli(
+                schema, prog=prog, args=list(words), default=default, config=(tyro.conf.FlagCreatePairsOff,)
+            )
             return parsed
     except SystemExit as stop:
         if stop.code in (0, None):

@@ -1,4 +1,5 @@
 import dataclasses
+import re
 import subprocess
 import sys
 import typing
@@ -118,6 +119,16 @@ def test_the_command_itself(capsys):
         assert captured.out == ""
         assert captured.err.count("\n") == 1
         assert hint in captured.err
+
+
+@pytest.mark.parametrize("command", ["online", "new", "check", "infer", "diagnose", "conceal", "evaluate"])
+def test_every_flag_that_help_shows_is_a_flag(command, capsys):
+    assert main([command, "--help"]) == 0
+    shown = set(re.findall(r"--[a-z][a-z-]*", re.sub(r"(?m)^usage.*", "", capsys.readouterr().out))) - {"--help"}
+    assert shown
+    for flag in shown:
+        main([command, flag, "--wrong"])
+        assert f"unknown flag {flag!r}" not in capsys.readouterr().err
 
 
 def test_systems_are_listed_with_priors_and_units(capsys):
