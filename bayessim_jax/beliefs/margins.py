@@ -11,7 +11,7 @@ import jax.scipy.special as jax_special
 import numpy as np
 import scipy.special as numpy_special
 from flax import struct
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from bayessim_jax.contracts import Scalar
 
@@ -149,6 +149,11 @@ class Margins:
     def size(self) -> int:
         """Number of parameters, d."""
         return len(self.names)
+
+    @property
+    def bounded(self) -> Bool[np.ndarray, " d"]:
+        """Which of them are shares Φ(z) of an interval."""
+        return np.array([m.kind in ("uniform", "log_uniform") for m in self.each], bool)
 
     def __add__(self, other: Margins) -> Margins:
         return Margins(self.names + other.names, self.each + other.each, self.units + other.units)

@@ -220,7 +220,8 @@ class Bench:
         own = [self.each[i] for i in self.columns(candidate)]
         low, high = (jax.device_put(np.array([getattr(m, side) for m in own], float)) for side in "ab")
         axes: Any = (0, None, None)
-        return dataclasses.replace(every, inputs=Tried(every.inputs, low, high), axes=Tried(*axes))
+        inputs, bounded = Tried(every.inputs, low, high), np.append(self.margins.bounded, np.ones(self.slots, bool))
+        return dataclasses.replace(every, inputs=inputs, bounded=jax.device_put(bounded), axes=Tried(*axes))
 
     def starts(self, candidate: Candidate, z: Float[Array, " d"]) -> list[Float[Array, " k"]]:
         """Points to begin from: θ as given, the effects a little off neutral, at their start values, and mirrored."""

@@ -23,7 +23,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from bayessim_jax.contracts import Scalar
-from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Curvature, eliminate
+from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Curvature, eliminate, stride
 from bayessim_jax.programs import trace_once
 from bayessim_jax.systems.mjcf import displace
 
@@ -46,6 +46,8 @@ __all__ = [
     "weigh",
 ]
 
+LONGEST = 1.0
+"""Step of p."""
 Numbers = Array | np.ndarray
 """What is put together on the host, or comes from a program."""
 
@@ -354,6 +356,7 @@ def propose(
     curvature: Curvature,
     damping: Scalar,
     free: Bool[Array, " k"],
+    bounded: Bool[Array, " k"],
     spread: Float[Array, " n"],
     p: Float[Array, " k"],
     delta: Float[Array, "windows n"],
@@ -363,8 +366,8 @@ def propose(
     held = jnp.outer(free, free)
     precision = jnp.where(held, precision, jnp.eye(len(free))) + damping * jnp.diag(jnp.diagonal(curvature.hessian))
     move = jnp.linalg.solve(precision, jnp.where(free, gradient, 0.0))
-    move = move * jnp.minimum(1.0, 1.0 / jnp.maximum(jnp.abs(move).max(initial=0.0), 1e-12))
-    return p + move, delta + (shift - toward @ move) * spread
+    to, move = stride(p, move, bounded, LONGEST)
+    return to, delta + (shift - toward @ move) * spread
 
 
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)

@@ -81,6 +81,7 @@ class Screen:
         self.shots, self.d, self.slots = scene.shots, scene.d, scene.slots
         self.pairs, self.name, self.takes, self.offsets = scene.pairs, scene.name, scene.takes, scene.offsets
         self.floor = noise_floor(scene.shots)
+        self.bounded = np.append(scene.margins.bounded, np.ones(scene.slots, bool))
         self.counts = np.maximum(np.asarray(scene.shots.measured).sum((0, 1)), 1)
 
     def twin(self) -> Screen:
@@ -152,7 +153,7 @@ class Screen:
                 damping *= 10
             if k + 1 < iterations:
                 moving = system if k == 0 and cost > bad else free
-                p, delta = propose(here[2], damping, moving, self.shots.spread, *here[:2])
+                p, delta = propose(here[2], damping, moving, self.bounded, self.shots.spread, *here[:2])
                 tried = (np.asarray(p), delta)
         return here if here is not None else (p, delta, None, None)
 

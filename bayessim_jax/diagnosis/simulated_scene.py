@@ -47,7 +47,8 @@ class SimulatedScene(CandidatesOf):
 
     def __init__(self, bench: Bench) -> None:
         self.bench = bench
-        self.shots, self.pairs, self.d, self.slots = bench.shots, bench.pairs, bench.d, bench.slots
+        self.margins, self.shots, self.pairs = bench.margins, bench.shots, bench.pairs
+        self.d, self.slots = bench.d, bench.slots
         own = [bench.columns(Candidate((k,))) for k in range(len(bench.pairs))]
         self.parameters = [[bench.parameters[i] for i in columns] for columns in own]
         self.margin: list[list[Margin]] = [[bench.each[i] for i in columns] for columns in own]

@@ -253,7 +253,7 @@ def _walk(
     """
     d = fit.z.size
     basis = np.linalg.eigh(np.asarray(fit.precision))[1]  # smallest precision first
-    turned = dataclasses.replace(shots, center=jnp.asarray(basis.T @ np.asarray(shots.center - fit.z)))
+    turned = dataclasses.replace(shots, center=jnp.asarray(basis.T @ np.asarray(shots.center - fit.z)), bounded=False)
 
     def along(a: Array, delta: Array, window: Any) -> Array:
         return predict(fit.z + basis @ a, delta, window)

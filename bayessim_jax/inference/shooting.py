@@ -23,6 +23,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax.scipy.special import ndtr, ndtri
+from jax.scipy.stats import norm
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from bayessim_jax.contracts import Scalar
@@ -46,6 +48,7 @@ __all__ = [
     "ridge",
     "robust_covariance",
     "solve",
+    "stride",
 ]
 
 Predict = Callable[[Float[Array, " d"], Float[Array, " n"], Any], Float[Array, "rows obs"]]
@@ -55,6 +58,8 @@ Predict = Callable[[Float[Array, " d"], Float[Array, " n"], Any], Float[Array, "
 TOLERANCE, ROUGH, DAMPING = 1e-7, 1e-4, 1e-3
 """Of the solver: the share of the cost that it ends with, where simulators are smooth and where not, and the damping
 that it begins with."""
+LONGEST, OUTERMOST = 2.0, 1e-4
+"""Step of z, and the share of an interval at either end into which no step back from the other end leads."""
 
 
 @struct.dataclass
@@ -72,6 +77,8 @@ class Shots:
     """Prior mean of z."""
     shift: Float[Array, "windows n"] | float = 0.0
     """Prior mean of δ."""
+    bounded: Bool[Array, " d"] | bool = False
+    """Which of z say where a value is in an interval, Φ(z)."""
     axes: Any = struct.field(pytree_node=False, default=0)
     """`vmap`'s `in_axes` of the inputs: None for what all windows share."""
 
@@ -247,6 +254,7 @@ class _Terms:
     center: Float[Array, " d"] | float
     shift: Float[Array, "windows n"] | float
     spread: Float[Array, " n"]
+    bounded: Bool[Array, " d"] | bool
     tolerance: float
 
 
@@ -295,11 +303,30 @@ def _propose(
     precision = jnp.where(jnp.outer(free, free), precision, jnp.eye(free.size))
     precision = precision + damping * jnp.diag(jnp.diagonal(here.hessian))
     move = jnp.where(free, jnp.linalg.solve(precision, jnp.where(free, gradient, 0.0)), 0.0)
-    move = move * jnp.minimum(1.0, 2.0 / jnp.maximum(jnp.abs(move).max(initial=0.0), 1e-12))
+    to, move = stride(at[0], move, terms.bounded, LONGEST)
     moves = shift - toward @ move
     stiff = move**2 @ jnp.diagonal(here.hessian) + (moves**2 * jnp.diagonal(here.own, axis1=-2, axis2=-1)).sum()
     promised = 0.5 * (move @ here.gradient + (moves * here.own_gradient).sum() + damping * stiff)
-    return (at[0] + move, at[1] + moves * terms.spread), promised
+    return (to, at[1] + moves * terms.spread), promised
+
+
+def stride(
+    z: Float[Array, " d"], move: Float[Array, " d"], bounded: Bool[Array, " d"] | bool, longest: float
+) -> tuple[Float[Array, " d"], Float[Array, " d"]]:
+    """Where a step along the slopes at z leads, and the part of it that is taken.
+
+    What is `bounded` is at Φ(z) of its interval. At its ends Φ is flat: a step back from there would be far too long,
+    and so small a part of it would be taken, of all other directions as well. Such a step is as long as it is in Φ.
+    Of all others none is longer than `longest`.
+    """
+
+    def lead(move: Float[Array, " d"]) -> Float[Array, " d"]:
+        inward = ndtri(jnp.clip(ndtr(z) + norm.pdf(z) * move, OUTERMOST, 1.0 - OUTERMOST)) - z
+        return jnp.where(bounded & (inward * move > 0.0) & (jnp.abs(inward) < jnp.abs(move)), inward, move)
+
+    free = jnp.where(lead(move) == move, jnp.abs(move), 0.0).max(initial=0.0)
+    taken = move * jnp.minimum(1.0, longest / jnp.maximum(free, 1e-12))
+    return z + lead(taken), taken
 
 
 def _arrive(march: _March, sigma: Array, terms: _Terms, shape: tuple[int, ...]) -> Fit:
@@ -354,7 +381,12 @@ def solve(
     kind = jnp.result_type(z)
     at, beside, noise = (jax.device_put(np.asarray(x, kind)) for x in (z, delta, sigma))
     terms = _Terms(
-        jax.device_put(np.asarray(free)), shots.center, shots.shift, shots.spread, ROUGH if step else TOLERANCE
+        jax.device_put(np.asarray(free)),
+        shots.center,
+        shots.shift,
+        shots.spread,
+        shots.bounded,
+        ROUGH if step else TOLERANCE,
     )
     march = _set_out(at, beside, shots.y.shape[1] * shots.y.shape[2], damping)
     for _ in range(int(steps)):

@@ -130,6 +130,7 @@ class CaseModel:
                 & _rows(windows)[..., None]
             ),
             spread=jnp.asarray(self._spread()),
+            bounded=jnp.asarray(self.margins.bounded),
         )
         if self.step_error is None:
             return shots

@@ -16,6 +16,7 @@ from bayessim_jax.inference.shooting import (
     ridge,
     robust_covariance,
     solve,
+    stride,
 )
 
 WINDOWS, ROWS = 6, 12
@@ -131,6 +132,31 @@ def test_a_step_into_a_divergence_is_refused():
     fit = solved(fragile, shots)
     assert bool(jnp.isfinite(fit.cost))
     assert float(fit.z[0]) <= 0.5
+
+
+def curved(z, delta, window):
+    """The same parabola with coefficients in intervals, Φ(z) of their widths from the lower ends."""
+    return line(8.0 * jax.scipy.special.ndtr(z) - 4.0, delta, window)
+
+
+@pytest.mark.parametrize("edge", [-3.0, 3.0])
+def test_a_step_back_from_the_edge_of_an_interval_is_no_obstacle(edge):
+    """The interval ends abruptly and z does not: a step that z's slope makes 50 long holds the other coefficient up."""
+    shots, _ = line_data(6, sigma=0.01)
+    start, still, sigma, free = jnp.array([edge, 0.0]), jnp.zeros((WINDOWS, 1)), jnp.array([0.01]), jnp.ones(2, bool)
+    ends = {steps: solve(curved, shots, start, still, sigma, free, steps=steps) for steps in (3, 60)}
+    known = {
+        steps: solve(curved, shots.replace(bounded=free), start, still, sigma, free, steps=steps) for steps in ends
+    }
+    assert known[60].converged
+    np.testing.assert_allclose(known[60].z, ends[60].z, atol=1e-3)
+    assert float(known[3].cost) < 0.01 * float(ends[3].cost)
+    # within the interval, and where there is none, steps are as they were
+    move = jnp.array([0.4, -30.0])
+    for where, bounded in ((jnp.zeros(2), True), (start, False)):
+        to, taken = stride(where, move, jnp.array([bounded, False]), 2.0)
+        np.testing.assert_allclose(to - where, taken)
+        np.testing.assert_allclose(jnp.abs(taken).max(), 2.0)
 
 
 def test_parameters_that_are_not_free_stay():
