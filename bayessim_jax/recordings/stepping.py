@@ -218,7 +218,9 @@ def _lead(
 
 
 def _with_runs(shots: Shots, runs: Float[np.ndarray, "windows nodes rows obs"]) -> Shots:
-    return dataclasses.replace(shots, inputs=Seen(shots.inputs, jnp.asarray(runs)))
+    """Windows beside what the time step does to them, of z with that of s, which has no ends."""
+    bounded = jnp.append(jnp.asarray(shots.bounded), False)
+    return dataclasses.replace(shots, inputs=Seen(shots.inputs, jnp.asarray(runs)), bounded=bounded)
 
 
 def _size(shots: Shots, fit: Fit, error: Float[np.ndarray, "windows rows obs"]) -> tuple[float, int]:
