@@ -416,7 +416,7 @@ def _promising(screen: Screen, ranked: Sequence[int]) -> list[int]:
 
 
 def _finalists(screen: Screen, nothing: Screened, ranked: Sequence[Screened]) -> list[Screened]:
-    """The best single effects, those that come near them, and relatives of the first."""
+    """The best single effects, those that come near them, relatives of the first, and the first on other actuators."""
     best = ranked[0].score - nothing.score
 
     def name(found: Screened) -> str:
@@ -428,7 +428,14 @@ def _finalists(screen: Screen, nothing: Screened, ranked: Sequence[Screened]) ->
         if i < LEADERS
         or (i < FINALISTS and found.score - nothing.score > WORTH * best)
         or are_kin(name(found), name(ranked[0]))
+        or _is_of_another_motor(name(found), name(ranked[0]))
     ]
+
+
+def _is_of_another_motor(one: str, other: str) -> bool:
+    """Whether two names are of one effect on two actuators: unknown masses trade one motor's gain for another's."""
+    (effect, place), (same, elsewhere) = (name.split("@", 1) for name in (one, other))
+    return effect == same and place != elsewhere and place.startswith("actuator/") and elsewhere.startswith("actuator/")
 
 
 def _pair(key: PRNGKeyArray, growth: _Growth, nothing: Screened, ranked: Sequence[Screened]) -> list[Screened]:
