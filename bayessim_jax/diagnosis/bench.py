@@ -28,7 +28,17 @@ from bayessim_jax.inference.shooting import COMPILER_OPTIONS, DAMPING, Fit, Shot
 from bayessim_jax.programs import trace_once
 from bayessim_jax.systems.mjcf import MjcfSystem, system_key
 
-__all__ = ["NEAR", "SLOTS", "Bench", "Candidate", "CandidatesOf", "begin_point", "begin_value", "margin_of_effect"]
+__all__ = [
+    "NEAR",
+    "SLOTS",
+    "Bench",
+    "Candidate",
+    "CandidatesOf",
+    "begin_point",
+    "begin_value",
+    "bounded_numbers",
+    "margin_of_effect",
+]
 
 NEAR = 0.1
 """Of the way from an effect's neutral value to where a fit usually begins: weak effects are found from there."""
@@ -220,8 +230,8 @@ class Bench:
         own = [self.each[i] for i in self.columns(candidate)]
         low, high = (jax.device_put(np.array([getattr(m, side) for m in own], float)) for side in "ab")
         axes: Any = (0, None, None)
-        inputs, bounded = Tried(every.inputs, low, high), np.append(self.margins.bounded, np.ones(self.slots, bool))
-        return dataclasses.replace(every, inputs=inputs, bounded=jax.device_put(bounded), axes=Tried(*axes))
+        bounded = jax.device_put(bounded_numbers(self.margins, self.slots))
+        return dataclasses.replace(every, inputs=Tried(every.inputs, low, high), bounded=bounded, axes=Tried(*axes))
 
     def starts(self, candidate: Candidate, z: Float[Array, " d"]) -> list[Float[Array, " k"]]:
         """Points to begin from: θ as given, the effects a little off neutral, at their start values, and mirrored."""
@@ -282,6 +292,11 @@ class Bench:
         """Variance of predictions `here` where every part of the initial states is off by so much."""
         moved = (self.replay(candidate, x, shots, jnp.asarray(move)) for move in np.diag(start))
         return sum(((y - here) ** 2 for y in moved), np.zeros_like(here))
+
+
+def bounded_numbers(margins: Margins, slots: int) -> Bool[np.ndarray, " k"]:
+    """Which numbers of a fit are shares of an interval: some of θ's, and all of the effects'."""
+    return np.append(margins.bounded, np.ones(slots, bool))
 
 
 def margin_of_effect(p: EffectParameter) -> Margin:

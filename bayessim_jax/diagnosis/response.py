@@ -47,7 +47,7 @@ __all__ = [
 ]
 
 LONGEST = 1.0
-"""Step of p."""
+"""The longest step of p, but for steps back from an end."""
 Numbers = Array | np.ndarray
 """What is put together on the host, or comes from a program."""
 

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 from scipy.special import ndtri
 
-from bayessim_jax.diagnosis.bench import NEAR, Candidate, begin_point
+from bayessim_jax.diagnosis.bench import NEAR, Candidate, begin_point, bounded_numbers
 from bayessim_jax.diagnosis.response import propose
 from bayessim_jax.diagnosis.scene import Scene
 from bayessim_jax.diagnosis.simulated_scene import SimulatedScene
@@ -81,7 +81,7 @@ class Screen:
         self.shots, self.d, self.slots = scene.shots, scene.d, scene.slots
         self.pairs, self.name, self.takes, self.offsets = scene.pairs, scene.name, scene.takes, scene.offsets
         self.floor = noise_floor(scene.shots)
-        self.bounded = np.append(scene.margins.bounded, np.ones(scene.slots, bool))
+        self.bounded = bounded_numbers(scene.margins, scene.slots)
         self.counts = np.maximum(np.asarray(scene.shots.measured).sum((0, 1)), 1)
 
     def twin(self) -> Screen:

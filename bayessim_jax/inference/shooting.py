@@ -59,7 +59,7 @@ TOLERANCE, ROUGH, DAMPING = 1e-7, 1e-4, 1e-3
 """Of the solver: the share of the cost that it ends with, where simulators are smooth and where not, and the damping
 that it begins with."""
 LONGEST, OUTERMOST = 2.0, 1e-4
-"""Step of z, and the share of an interval at either end into which no step back from the other end leads."""
+"""The longest step of z, and the share of an interval at either end into which no step from the other one leads."""
 
 
 @struct.dataclass

@@ -153,4 +153,4 @@ def test_a_real_vehicle_lacks_more_than_two_effects(tmp_path):
     assert table["misfit"]["p_value"] < 0.05
     assert table["absorbed"] == ABSORBED
     closest = re.search("The closest, (.*), leaves", (tmp_path / "run" / "report.html").read_text())
-    assert closest and re.search("actuator_(lag|delay)", closest.group(1))
+    assert closest and re.search(r"actuator_(lag|delay)@actuator/\*", closest.group(1))
