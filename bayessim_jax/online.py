@@ -80,8 +80,9 @@ class Setup:
     """Rounds whose simulations are kept for the fit."""
     history: int = struct.field(pytree_node=False, default=32)
     """Recordings of the target that are remembered, the newest; the posterior is conditioned on all of them."""
-    calibrations: int = struct.field(pytree_node=False, default=256)
-    """Draws of θ for which as many recordings are simulated as the target has given, to calibrate their posterior."""
+    calibrations: int = struct.field(pytree_node=False, default=1024)
+    """Draws of θ for which as many recordings are simulated as the target has given: what the posterior of several
+    recordings is learned from, and calibrated."""
     components: int = struct.field(pytree_node=False, default=5)
     """Gaussians in the belief."""
     replay: bool = struct.field(pytree_node=False, default=False)
@@ -218,7 +219,7 @@ def init(key: PRNGKeyArray, setup: Setup) -> State:
     return State(
         round=jnp.array(0),
         belief=belief,
-        estimator=setup.estimator.init(estimator_key, empty(1), d),
+        estimator=setup.estimator.init(estimator_key, empty(remembered), d),
         learner=learner,
         pool=Pool(
             thetas=jnp.broadcast_to(belief.box.low, (slots, setup.simulations, d)),

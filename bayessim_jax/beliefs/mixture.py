@@ -81,6 +81,11 @@ class GaussianMixture:
         trils = scale[:, None] * self.scale_trils * sign[None, :]
         return GaussianMixture(self.log_weights, shift + scale * self.means, trils)
 
+    def widen(self, factor: float | Scalar) -> GaussianMixture:
+        """The law of E θ + factor · (θ − E θ)."""
+        mean = self.mean()
+        return GaussianMixture(self.log_weights, mean + factor * (self.means - mean), factor * self.scale_trils)
+
 
 def moment_match(mixture: GaussianMixture) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
     """The Gaussian with the mixture's mean and covariance, as (mean, scale_tril): the nearest one in KL(mixture‖·)."""

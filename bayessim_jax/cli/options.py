@@ -143,8 +143,8 @@ class Settings:
     """Rounds whose simulations are kept for the fit."""
     history: int = 32
     """Recordings of the target that are remembered; the posterior is conditioned on all of them."""
-    calibrations: int = 256
-    """Sets of recordings simulated in a round to calibrate the posterior of the set."""
+    calibrations: int = 1024
+    """Sets of recordings simulated in a round, to learn the posterior of a set from and to calibrate it."""
     components: int = 5
     """Gaussians in the posterior."""
     noise: float = 0.01

@@ -10,15 +10,17 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from bayessim_jax.beliefs import GaussianMixture
-from bayessim_jax.contracts import Box, Recording
+from bayessim_jax.beliefs import GaussianMixture, moment_match
+from bayessim_jax.contracts import Box, Recording, Scalar
 from bayessim_jax.inference.encoders import Encoder, Features, lookup_encoder, transition_features
 from bayessim_jax.inference.evidence import combine_evidence
 from bayessim_jax.inference.fit import FitInfo, Schedule, fit
 from bayessim_jax.inference.heads import MixtureHead
+from bayessim_jax.inference.readout import Readout, read_sets
 from bayessim_jax.inference.recalibration import (
     CalibrationInfo,
     Recalibration,
+    by_number,
     credible_levels,
     judge,
     nearness,
@@ -45,7 +47,8 @@ class EstimatorState:
     feature_scale: Float[Array, " features"]
     shift: Float[Array, " d"]
     scale: Float[Array, " d"]
-    recalibration: Recalibration
+    correction: Recalibration | Readout
+    """What sets that no network has seen say of the posterior of one recording, or of several."""
     fitted: Bool[Array, ""]
     """Whether the feature units are set; they are taken from the first fit and kept."""
 
@@ -96,7 +99,7 @@ class MixtureDensity:
             feature_scale=jnp.ones(features),
             shift=jnp.zeros(d),
             scale=jnp.ones(d),
-            recalibration=Recalibration.none(d),
+            correction=Recalibration.none(d) if example.diverged.shape[0] == 1 else Readout.none(d),
             fitted=jnp.array(False),
         )
 
@@ -158,18 +161,27 @@ class MixtureDensity:
         plain = jax.lax.map(
             lambda one: self._combined(state.params, one[0], one[1] & one[2][:, None], one[2]), (x, valid, sound)
         )
-        weights = nearness(plain, self._plain(state, observed, use))
+        seen = self._plain(state, observed, use)
+        weights = nearness(plain, seen)
         low, high = ((bound - state.shift) / state.scale for bound in (box.low, box.high))
         before = credible_levels(key, plain, z, low, high, jnp.ones(1))[:, 0]
         if not correct:
             return state, judge(before, before, weights, z.shape[1], jnp.ones(()))
-        recalibration, after = recalibrate(key, plain, z, weights, low, high)
-        widen = jnp.exp(jnp.log(jnp.diagonal(recalibration.stretch)).mean())
-        return replace(state, recalibration=recalibration), judge(before, after, weights, z.shape[1], widen)
+        if isinstance(state.correction, Readout):
+            correction, after = read_sets(key, plain, z, low, high)
+        else:
+            correction, after = recalibrate(key, plain, z, weights, low, high)
+        held = after.size
+        widen = _width(correction.apply(seen)) / _width(seen)
+        info = judge(before[:held], after, by_number(weights[:held]), z.shape[1], widen)
+        return replace(state, correction=correction), info
 
     def posterior(self, state: EstimatorState, recordings: Recording, use: Bool[Array, " set"]) -> GaussianMixture:
         """The mixture q(θ | recordings in use), for one set, in the units of θ."""
-        return state.recalibration.apply(self._plain(state, recordings, use)).affine(state.shift, state.scale)
+        plain = self._plain(state, recordings, use)
+        if isinstance(state.correction, Recalibration) or recordings.diverged.size > 1:
+            plain = state.correction.apply(plain)
+        return plain.affine(state.shift, state.scale)
 
     def _log_prob(self, params: Any, inputs: Any, z: Float[Array, "n d"]) -> Float[Array, " n"]:
         return self.head.log_prob(params["head"], self.encoder.apply(params["encoder"], *inputs), z)
@@ -225,6 +237,12 @@ class MixtureDensity:
             scale=spread,
             fitted=jnp.array(True),
         )
+
+
+def _width(mixture: GaussianMixture) -> Scalar:
+    """Geometric mean of the standard deviations along the axes of its ellipsoid."""
+    _, tril = moment_match(mixture)
+    return jnp.exp(jnp.log(jnp.diagonal(tril)).mean())
 
 
 def recurrent_mixture(

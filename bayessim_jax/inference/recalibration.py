@@ -7,7 +7,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from scipy.special import chdtr, chdtri
 
 from bayessim_jax.beliefs import GaussianMixture, moment_match
@@ -19,6 +19,8 @@ __all__ = [
     "SCALES",
     "CalibrationInfo",
     "Recalibration",
+    "best_scale",
+    "by_number",
     "credible_levels",
     "judge",
     "nearness",
@@ -99,8 +101,12 @@ def nearness(mixtures: GaussianMixture, observed: GaussianMixture, share: float 
     gaps = ((jax.vmap(GaussianMixture.mean)(mixtures) - observed.mean()) ** 2).sum(-1)
     reach = jnp.sort(gaps)[int(share * (gaps.size - 1))]
     weights = jnp.maximum(1.0 - gaps / jnp.maximum(reach, 1e-12), 0.0)
-    weights = jnp.where(weights.sum() > 0, weights, 1.0)
-    return weights * weights.sum() / (weights**2).sum()
+    return by_number(jnp.where(weights.sum() > 0, weights, 1.0))
+
+
+def by_number(weights: Float[Array, " n"]) -> Float[Array, " n"]:
+    """The same weights scaled so that their sum is the number of pairs that they stand for, Σ w = (Σ w)² / Σ w²."""
+    return weights * weights.sum() / jnp.maximum((weights**2).sum(), 1e-12)
 
 
 def regress(
@@ -160,11 +166,9 @@ def recalibrate(
     """The correction that makes held-out truths look like draws of their posteriors, and the levels that show it.
 
     `regress` on all pairs, and of `SCALES` the factor on its stretch at which the credible levels c of the truths, in
-    posteriors cut to the box, are nearest to uniform: the least Σₐ (P(c ≤ a) − a)² / (a (1 − a)) over `LEVELS`. Second
-    moments alone do not say that: a sharp core with wide tails, and what the box cuts off, change the mass of a set.
-    The factor is chosen, and the levels returned are taken, on each half of the pairs with the regression on the other.
-
-    Source: Anderson and Darling 1952
+    posteriors cut to the box, are nearest to uniform (`best_scale`). Second moments alone do not say that: a sharp core
+    with wide tails, and what the box cuts off, change the mass of a set. The factor is chosen, and the levels returned
+    are taken, on each half of the pairs with the regression on the other.
     """
     even = jnp.arange(truths.shape[0]) % 2 == 0
     parts = jnp.stack([weights, jnp.where(even, 0.0, weights), jnp.where(even, weights, 0.0)])
@@ -173,10 +177,18 @@ def recalibrate(
     other = jax.tree.map(lambda leaf: leaf[jnp.where(even, 1, 2)], found)
     crossed = jax.vmap(lambda correction, mixture: correction.apply(mixture))(other, mixtures)
     levels = credible_levels(key, crossed, truths, low, high, jnp.array(SCALES))
+    best = best_scale(levels, weights)
+    return replace(whole, stretch=jnp.array(SCALES)[best] * whole.stretch), levels[:, best]
+
+
+def best_scale(levels: Float[Array, "n scales"], weights: Float[Array, " n"]) -> Int[Array, ""]:
+    """Which column of credible levels c is nearest to uniform: the least Σₐ (P(c ≤ a) − a)² / (a (1 − a)).
+
+    Source: Anderson and Darling 1952
+    """
     asked = jnp.array(LEVELS)
     covered = jnp.einsum("n,nsa->sa", weights / weights.sum(), levels[..., None] <= asked)
-    best = jnp.argmin(((covered - asked) ** 2 / (asked * (1 - asked))).sum(-1))
-    return replace(whole, stretch=jnp.array(SCALES)[best] * whole.stretch), levels[:, best]
+    return jnp.argmin(((covered - asked) ** 2 / (asked * (1 - asked))).sum(-1))
 
 
 def credible_levels(

@@ -92,3 +92,10 @@ def test_log_prob_has_finite_derivatives_far_away_and_with_an_empty_component():
     mixture = mixture.replace(log_weights=mixture.log_weights.at[0].set(-jnp.inf))
     grads = jax.jit(jax.grad(lambda m, t: m.log_prob(t), (0, 1)))(mixture, jnp.full(3, 50.0))
     assert all(jnp.isfinite(g).all() for g in jax.tree.leaves(grads))
+
+
+def test_widening_keeps_the_mean_and_scales_the_covariance():
+    mixture = random_mixture(3)
+    wide = mixture.widen(1.7)
+    assert jnp.allclose(wide.mean(), mixture.mean(), atol=1e-5)
+    assert jnp.allclose(wide.covariance(), 1.7**2 * mixture.covariance(), rtol=1e-4)

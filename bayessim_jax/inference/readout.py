@@ -1,0 +1,146 @@
+"""The posterior of a set of recordings, read by small networks from what the evidence of its recordings adds up to."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from bayessim_jax.beliefs import GaussianMixture, moment_match
+from bayessim_jax.beliefs.triangular import solve_lower
+from bayessim_jax.contracts import Scalar
+from bayessim_jax.inference.fit import Schedule, fit
+from bayessim_jax.inference.heads import MixtureHead
+from bayessim_jax.inference.recalibration import SCALES, Recalibration, best_scale, credible_levels, regress
+
+__all__ = ["Readout", "read_sets"]
+
+HEAD = MixtureHead(components=5, hidden=32)
+MEMBERS, FOLDS = 2, 5
+"""Networks, and parts of the sets: network m holds out part m."""
+FARTHEST = 30.0
+"""Standardized errors beyond which they count as that."""
+
+
+@struct.dataclass
+class Readout:
+    """θ given the moments (μ, L) of a set's combined evidence: those of a corrected Gaussian, and a shape in its units.
+
+        θ = μ' + L' ρ,   (μ', L') = Recalibration(μ, L),   ρ ~ Σₖ αₖ N(mₖ, Sₖ)
+
+    The mixture is what networks say at (μ, L), spread by a factor about its mean; with weights of zero it is N(0, I).
+    """
+
+    recalibration: Recalibration
+    origin: Float[Array, " features"]
+    unit: Float[Array, " features"]
+    params: Any
+    """Weights of `HEAD`, one set for each network (leading axis)."""
+    scale: Scalar
+
+    @classmethod
+    def none(cls, d: int) -> Readout:
+        """The Gaussian with the moments of what is read."""
+        features = 2 * d + d * (d - 1) // 2
+        params = jax.tree.map(jnp.zeros_like, HEAD.init(jax.random.key(0), features, d))
+        several = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (MEMBERS, *leaf.shape)), params)
+        return cls(Recalibration.none(d), jnp.zeros(features), jnp.ones(features), several, jnp.ones(()))
+
+    def apply(self, mixture: GaussianMixture) -> GaussianMixture:
+        """The average of what the networks say."""
+        every = jax.vmap(lambda params: self._said(params, mixture))(self.params)
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), every)
+
+    def _said(self, params: Any, mixture: GaussianMixture) -> GaussianMixture:
+        mean, tril = moment_match(self.recalibration.apply(mixture))
+        shape = HEAD.mixture(params, self._read(mixture)).widen(self.scale)
+        return GaussianMixture(shape.log_weights, mean + shape.means @ tril.T, tril @ shape.scale_trils)
+
+    def _read(self, mixture: GaussianMixture) -> Float[Array, " features"]:
+        return jnp.clip((_moments(mixture) - self.origin) / self.unit, -3.0, 3.0)
+
+
+def read_sets(
+    key: PRNGKeyArray,
+    mixtures: GaussianMixture,
+    truths: Float[Array, "n d"],
+    low: Float[Array, " d"],
+    high: Float[Array, " d"],
+) -> tuple[Readout, Float[Array, " held"]]:
+    """Learn θ of n sets from the moments of their combined evidence, and make the credible sets hold their share.
+
+    The product of the evidence of many recordings is a summary of the set, not its posterior: an error that networks
+    make at one θ for every recording alike is counted in it as often as there are recordings, and where evidence is
+    weak, or bent, or cut by the prior's box, the posterior is no Gaussian. So θ is regressed on the summary by
+    conditional density estimation: `regress` takes out what is linear, and networks learn the law of what is left. A
+    network that predicts the sets that it did not see no better than N(0, I) does, by more than the standard error of
+    the difference, is left at N(0, I). Of `SCALES` the one is taken at which credible sets that are cut to the box
+    hold their share of the truths, for sets that a network has not seen.
+
+    Returns the readout, and the credible levels of the truths of the first sets, those that one of the networks holds
+    out, as this network says.
+
+    Source: Blum and François 2010; Papamakarios and Murray 2016
+    """
+    fit_key, level_key = jax.random.split(key)
+    n, d = truths.shape
+    part = FOLDS * jnp.arange(n) // n
+    moments = jax.vmap(_moments)(mixtures)
+    readout = replace(
+        Readout.none(d),
+        recalibration=regress(mixtures, truths, (part >= MEMBERS).astype(truths.dtype)),
+        origin=moments.mean(0),
+        unit=moments.std(0) + 1e-6,
+    )
+
+    def standardize(mixture: GaussianMixture, truth: Array) -> Array:
+        mean, tril = moment_match(readout.recalibration.apply(mixture))
+        return jnp.clip(solve_lower(tril, truth - mean), -FARTHEST, FARTHEST)
+
+    x, left = jax.vmap(readout._read)(mixtures), jax.vmap(standardize)(mixtures, truths)
+    schedule = Schedule(
+        epochs=60,
+        draws=n,
+        batch=min(64, n),
+        check_every=2,
+        patience=20,
+        validation_draws=max(n // FOLDS, 1),
+        weight_decay=1e-3,
+    )
+
+    def member(args: Any) -> Any:
+        key, unseen, nothing = args
+        start = HEAD.init(key, x.shape[1], d)
+        start |= {"out": 0.1 * start["out"]}
+        params, _ = fit(key, start, HEAD.log_prob, x, left, jnp.ones(n), unseen, schedule)
+        gain = HEAD.log_prob(params, x, left) - HEAD.log_prob(nothing, x, left)
+        count = unseen.sum()
+        mean = jnp.where(unseen, gain, 0.0).sum() / count
+        variance = jnp.where(unseen, (gain - mean) ** 2, 0.0).sum() / count
+        better = mean > jnp.sqrt(variance / count)
+        return jax.tree.map(lambda a, b: jnp.where(better, a, b), params, nothing)
+
+    unseen = part == jnp.arange(MEMBERS)[:, None]
+    params = jax.lax.map(member, (jax.random.split(fit_key, MEMBERS), unseen, readout.params))
+    readout = replace(readout, params=params)
+
+    held = -(-n * MEMBERS // FOLDS)
+    own, sets, z = (
+        jax.tree.map(lambda leaf: leaf[part[:held]], params),
+        *jax.tree.map(lambda leaf: leaf[:held], (mixtures, truths)),
+    )
+    levels = credible_levels(level_key, jax.vmap(readout._said)(own, sets), z, low, high, jnp.array(SCALES))
+    best = best_scale(levels, jnp.ones(held))
+    return replace(readout, scale=jnp.array(SCALES)[best]), levels[:, best]
+
+
+def _moments(mixture: GaussianMixture) -> Float[Array, " features"]:
+    """Mean, logarithms of L's diagonal, and what is below it in units of it."""
+    mean, tril = moment_match(mixture)
+    rows, columns = jnp.tril_indices(mean.size, -1)
+    diagonal = jnp.diagonal(tril)
+    return jnp.concatenate([mean, jnp.log(diagonal), tril[rows, columns] / diagonal[rows]])
