@@ -57,6 +57,8 @@ COMPILER_OPTIONS = {"xla_backend_optimization_level": 1}
 
 FOREVER = 2**30
 """More rounds than any run has."""
+SETS, FEWEST, MOST = 32_768, 1024, 4096
+"""Recordings that are simulated in a round as sets, where nothing else is asked for, and how few and many sets."""
 
 
 @struct.dataclass
@@ -80,7 +82,7 @@ class Setup:
     """Rounds whose simulations are kept for the fit."""
     history: int = struct.field(pytree_node=False, default=32)
     """Recordings of the target that are remembered, the newest; the posterior is conditioned on all of them."""
-    calibrations: int = struct.field(pytree_node=False, default=1024)
+    calibrations: int = struct.field(pytree_node=False, default=FEWEST)
     """Draws of θ for which as many recordings are simulated as the target has given: what the posterior of several
     recordings is learned from, and calibrated."""
     components: int = struct.field(pytree_node=False, default=5)
@@ -111,10 +113,16 @@ class Setup:
         forget: float = 0.0,
         **sizes: int,
     ) -> Setup:
-        """The paper's settings, unless told otherwise; the prior is uniform on `system.parameters`."""
+        """The paper's settings, unless told otherwise; the prior is uniform on `system.parameters`.
+
+        `calibrations` of 0 are as many sets as make 32,768 recordings, but 1024 at least and 4096 at most: where few
+        recordings are remembered, more of their sets are to be had at the same cost.
+        """
         for name, value in sizes.items():
-            if value < (0 if name in ("evaluations", "warmup", "inferences") else 1):
+            if value < (0 if name in ("evaluations", "warmup", "inferences", "calibrations") else 1):
                 raise ValueError(f"Setup: {name} is {value}; it must be a positive number.")
+        if not sizes.get("calibrations"):
+            sizes["calibrations"] = min(max(SETS // sizes.get("history", cls.history), FEWEST), MOST)
         if not 0 <= forget < 1:
             raise ValueError(f"Setup: forget is {forget}; it is a probability, from 0 to below 1.")
         if sizes.get("history", cls.history) % sizes.get("recordings", cls.recordings):

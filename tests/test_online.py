@@ -52,6 +52,27 @@ def run():
     return compiled(online.run, static_argnames="rounds")
 
 
+@pytest.mark.parametrize(("history", "sets"), [(4, 4096), (16, 2048), (32, 1024), (160, 1024)])
+def test_the_shorter_the_memory_the_more_sets_it_is_judged_by(history, sets):
+    system = CartPole.create()
+    make = lambda **sizes: online.Setup.create(system, Fixed(RandomPolicy(system.actions)), history=history, **sizes)  # noqa: E731
+    assert make().calibrations == make(calibrations=0).calibrations == sets
+    assert make(calibrations=7).calibrations == 7
+    with pytest.raises(ValueError, match="calibrations is -1"):
+        make(calibrations=-1)
+
+
+def test_one_recording_beside_a_readout_of_sets_is_what_the_networks_say(cartpole):
+    setup, target = cartpole
+    state = online.init(jax.random.key(0), setup)
+    seen = online.record(jax.random.key(1), setup, target, state)
+    moved = state.estimator.replace(correction=state.estimator.correction.replace(scale=jnp.array(3.0)))
+    alone = [setup.estimator.posterior(e, seen, jnp.ones(1, bool)) for e in (state.estimator, moved)]
+    assert _same(*alone) and alone[0].log_weights.size == 2
+    sets = [setup.estimator.posterior(e, state.history, jnp.ones(4, bool)) for e in (state.estimator, moved)]
+    assert jnp.allclose(sets[1].covariance(), 9.0 * sets[0].covariance(), rtol=1e-4)
+
+
 def _same(a, b):
     leaves = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
     return all(bool(jnp.array_equal(x, y, equal_nan=jnp.issubdtype(x.dtype, jnp.floating))) for x, y in leaves)

@@ -64,12 +64,13 @@ Run = Annotated[
     tyro.conf.arg(name="from"),
 ]
 """A run folder, kept as an absolute path: a run is continued from anywhere."""
-COUNTS = ("rounds", "seeds", "steps", "recordings", "pool", "history", "calibrations", "components")
+COUNTS = ("rounds", "seeds", "steps", "recordings", "pool", "history", "components")
 LEAST = {
     **dict.fromkeys(COUNTS, 1),
     "simulations": 10,
     "seed": 0,
     "evaluations": 0,
+    "calibrations": 0,
     "warmup": 0,
     "noise": 0.0,
     "forget": 0.0,
@@ -143,8 +144,9 @@ class Settings:
     """Rounds whose simulations are kept for the fit."""
     history: int = 32
     """Recordings of the target that are remembered; the posterior is conditioned on all of them."""
-    calibrations: int = 1024
-    """Sets of recordings simulated in a round, to learn the posterior of a set from and to calibrate it."""
+    calibrations: int = 0
+    """Sets of recordings simulated in a round, to learn the posterior of a set from and to calibrate it; 0 for as many
+    as make 32768 recordings, from 1024 to 4096."""
     components: int = 5
     """Gaussians in the posterior."""
     noise: float = 0.01

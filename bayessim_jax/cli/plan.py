@@ -182,6 +182,7 @@ def _make_plan(settings: Settings) -> Plan:
         settings,
         target=kind,
         controller=controller,
+        calibrations=setup.calibrations,
         diagnosis=str(Path(settings.diagnosis).resolve()) if settings.diagnosis else "",
         prior={n: (_short(a), _short(b)) for n, a, b in zip(names, box.low, box.high, strict=True)},
         schedule=pace,

@@ -156,12 +156,8 @@ class MixtureDensity:
         The half of them whose posteriors sit nearest that of the set observed counts, the nearest most.
         """
         z = (thetas - state.shift) / state.scale
-        x, valid = self._inputs(state, recordings)
-        sound = use & ~recordings.diverged
-        plain = jax.lax.map(
-            lambda one: self._combined(state.params, one[0], one[1] & one[2][:, None], one[2]), (x, valid, sound)
-        )
-        seen = self._plain(state, observed, use)
+        every = jax.tree.map(lambda leaf, one: jnp.concatenate([leaf, one[None]]), recordings, observed)
+        plain, seen = _last(jax.lax.map(lambda one: self._plain(state, one, use), every))
         weights = nearness(plain, seen)
         low, high = ((bound - state.shift) / state.scale for bound in (box.low, box.high))
         before = credible_levels(key, plain, z, low, high, jnp.ones(1))[:, 0]
@@ -192,27 +188,17 @@ class MixtureDensity:
         return jnp.where(recordings.valid[..., None], x, 0.0), recordings.valid
 
     def _plain(self, state: EstimatorState, recordings: Recording, use: Bool[Array, " set"]) -> GaussianMixture:
-        """The networks' posterior of one set, in standardized θ."""
+        """The networks' posterior of one set, in standardized θ; that of several recordings is one Gaussian."""
         x, valid = self._inputs(state, jax.tree.map(lambda leaf: leaf[None], recordings))
         use = use & ~recordings.diverged
-        return self._combined(state.params, x[0], valid[0] & use[:, None], use)
-
-    def _combined(
-        self, params: Any, x: Float[Array, "set steps features"], valid: Array, use: Bool[Array, " set"]
-    ) -> GaussianMixture:
-        """The ensemble's posterior of one set in standardized θ, before recalibration."""
+        valid = valid[0] & use[:, None]
 
         def member(p: Any) -> GaussianMixture:
-            return jax.vmap(lambda e: self.head.mixture(p["head"], e))(self.encoder.apply(p["encoder"], x, valid))
+            return jax.vmap(lambda e: self.head.mixture(p["head"], e))(self.encoder.apply(p["encoder"], x[0], valid))
 
-        each = jax.vmap(member, out_axes=1)(params)  # (set, members, K, …)
+        each = jax.vmap(member, out_axes=1)(state.params)  # (set, members, K, …)
         each = jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0], -1, *leaf.shape[3:]), each)
-        alone = jax.tree.map(lambda leaf: leaf[jnp.argmax(use)], each)
-        if x.shape[0] == 1:
-            return alone
-        count = alone.log_weights.size
-        together = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), combine_evidence(each, use))
-        return jax.tree.map(lambda a, b: jnp.where(use.sum() == 1, b, a), together, alone)
+        return jax.tree.map(lambda leaf: leaf[0], each) if use.size == 1 else combine_evidence(each, use)
 
     def _set_units(self, state: EstimatorState, thetas: Array, recordings: Recording, weights: Array) -> EstimatorState:
         x = jax.vmap(jax.vmap(self.features))(recordings)
@@ -237,6 +223,11 @@ class MixtureDensity:
             scale=spread,
             fitted=jnp.array(True),
         )
+
+
+def _last(tree: Any) -> tuple[Any, Any]:
+    """All but the last row, and the last row."""
+    return jax.tree.map(lambda leaf: leaf[:-1], tree), jax.tree.map(lambda leaf: leaf[-1], tree)
 
 
 def _width(mixture: GaussianMixture) -> Scalar:

@@ -74,9 +74,7 @@ class MixtureHead:
     def mixture(self, params: Any, x: Float[Array, " inputs"]) -> GaussianMixture:
         """q(z | x) as a belief."""
         log_weights, means, factors = self.apply(params, x)
-        inverse = jax.vmap(invert)(factors)
-        covariance = inverse @ jnp.swapaxes(inverse, -1, -2)
-        return GaussianMixture(log_weights, means, jnp.linalg.cholesky(covariance))
+        return GaussianMixture(log_weights, means, jax.vmap(invert)(factors))  # Σ = A⁻¹ A⁻ᵀ
 
     def change_units(self, params: Any, shift: Float[Array, " d"], scale: Float[Array, " d"]) -> Any:
         """The parameters that give the same density for z' = (z − shift) / scale."""

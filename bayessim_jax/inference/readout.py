@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from bayessim_jax.beliefs import GaussianMixture, moment_match
+from bayessim_jax.beliefs import GaussianMixture
 from bayessim_jax.beliefs.triangular import solve_lower
 from bayessim_jax.contracts import Scalar
 from bayessim_jax.inference.fit import Schedule, fit
@@ -30,7 +30,7 @@ FARTHEST = 30.0
 class Readout:
     """θ given the moments (μ, L) of a set's combined evidence: those of a corrected Gaussian, and a shape in its units.
 
-        θ = μ' + L' ρ,   (μ', L') = Recalibration(μ, L),   ρ ~ Σₖ αₖ N(mₖ, Sₖ)
+        θ = μ' + L' ρ,   μ' = μ + L shift(μ),   L' = L stretch,   ρ ~ Σₖ αₖ N(mₖ, Sₖ)
 
     The mixture is what networks say at (μ, L), spread by a factor about its mean; with weights of zero it is N(0, I).
     """
@@ -50,28 +50,35 @@ class Readout:
         several = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (MEMBERS, *leaf.shape)), params)
         return cls(Recalibration.none(d), jnp.zeros(features), jnp.ones(features), several, jnp.ones(()))
 
-    def apply(self, mixture: GaussianMixture) -> GaussianMixture:
-        """The average of what the networks say."""
-        every = jax.vmap(lambda params: self._said(params, mixture))(self.params)
+    def apply(self, evidence: GaussianMixture) -> GaussianMixture:
+        """The average of what the networks say of one Gaussian."""
+        every = jax.vmap(lambda params: self.said(params, evidence))(self.params)
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), every)
 
-    def _said(self, params: Any, mixture: GaussianMixture) -> GaussianMixture:
-        mean, tril = moment_match(self.recalibration.apply(mixture))
-        shape = HEAD.mixture(params, self._read(mixture)).widen(self.scale)
+    def said(self, params: Any, evidence: GaussianMixture) -> GaussianMixture:
+        """What the network with these weights says."""
+        mean, tril = self.correct(evidence)
+        shape = HEAD.mixture(params, self.read(evidence)).widen(self.scale)
         return GaussianMixture(shape.log_weights, mean + shape.means @ tril.T, tril @ shape.scale_trils)
 
-    def _read(self, mixture: GaussianMixture) -> Float[Array, " features"]:
-        return jnp.clip((_moments(mixture) - self.origin) / self.unit, -3.0, 3.0)
+    def correct(self, evidence: GaussianMixture) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
+        """μ' and L'."""
+        mean, tril = evidence.means[0], evidence.scale_trils[0]
+        return mean + tril @ self.recalibration.shift(mean), tril @ self.recalibration.stretch
+
+    def read(self, evidence: GaussianMixture) -> Float[Array, " features"]:
+        """What networks see: (μ, L), standardized."""
+        return jnp.clip((_moments(evidence) - self.origin) / self.unit, -3.0, 3.0)
 
 
 def read_sets(
     key: PRNGKeyArray,
-    mixtures: GaussianMixture,
+    evidence: GaussianMixture,
     truths: Float[Array, "n d"],
     low: Float[Array, " d"],
     high: Float[Array, " d"],
 ) -> tuple[Readout, Float[Array, " held"]]:
-    """Learn θ of n sets from the moments of their combined evidence, and make the credible sets hold their share.
+    """Learn θ of n sets from their combined evidence, a Gaussian each, and make the credible sets hold their share.
 
     The product of the evidence of many recordings is a summary of the set, not its posterior: an error that networks
     make at one θ for every recording alike is counted in it as often as there are recordings, and where evidence is
@@ -89,19 +96,19 @@ def read_sets(
     fit_key, level_key = jax.random.split(key)
     n, d = truths.shape
     part = FOLDS * jnp.arange(n) // n
-    moments = jax.vmap(_moments)(mixtures)
+    moments = jax.vmap(_moments)(evidence)
     readout = replace(
         Readout.none(d),
-        recalibration=regress(mixtures, truths, (part >= MEMBERS).astype(truths.dtype)),
+        recalibration=regress(evidence, truths, (part >= MEMBERS).astype(truths.dtype)),
         origin=moments.mean(0),
         unit=moments.std(0) + 1e-6,
     )
 
-    def standardize(mixture: GaussianMixture, truth: Array) -> Array:
-        mean, tril = moment_match(readout.recalibration.apply(mixture))
+    def standardize(evidence: GaussianMixture, truth: Array) -> Array:
+        mean, tril = readout.correct(evidence)
         return jnp.clip(solve_lower(tril, truth - mean), -FARTHEST, FARTHEST)
 
-    x, left = jax.vmap(readout._read)(mixtures), jax.vmap(standardize)(mixtures, truths)
+    x, left = jax.vmap(readout.read)(evidence), jax.vmap(standardize)(evidence, truths)
     schedule = Schedule(
         epochs=60,
         draws=n,
@@ -131,16 +138,16 @@ def read_sets(
     held = -(-n * MEMBERS // FOLDS)
     own, sets, z = (
         jax.tree.map(lambda leaf: leaf[part[:held]], params),
-        *jax.tree.map(lambda leaf: leaf[:held], (mixtures, truths)),
+        *jax.tree.map(lambda leaf: leaf[:held], (evidence, truths)),
     )
-    levels = credible_levels(level_key, jax.vmap(readout._said)(own, sets), z, low, high, jnp.array(SCALES))
+    levels = credible_levels(level_key, jax.vmap(readout.said)(own, sets), z, low, high, jnp.array(SCALES))
     best = best_scale(levels, jnp.ones(held))
     return replace(readout, scale=jnp.array(SCALES)[best]), levels[:, best]
 
 
-def _moments(mixture: GaussianMixture) -> Float[Array, " features"]:
+def _moments(evidence: GaussianMixture) -> Float[Array, " features"]:
     """Mean, logarithms of L's diagonal, and what is below it in units of it."""
-    mean, tril = moment_match(mixture)
+    mean, tril = evidence.means[0], evidence.scale_trils[0]
     rows, columns = jnp.tril_indices(mean.size, -1)
     diagonal = jnp.diagonal(tril)
     return jnp.concatenate([mean, jnp.log(diagonal), tril[rows, columns] / diagonal[rows]])

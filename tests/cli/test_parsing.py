@@ -186,12 +186,14 @@ def test_the_defaults_are_those_of_the_library():
     import inspect
 
     from bayessim_jax import online
-    from bayessim_jax.cli.plan import INFERENCES
+    from bayessim_jax.cli.plan import INFERENCES, make_plan
     from bayessim_jax.inference.estimators import recurrent_mixture
 
     settings = Settings("cartpole")
+    setup = make_plan(settings).setup
+    assert setup.calibrations == online.Setup.create(setup.system, setup.learner, setup.task).calibrations
     for field in dataclasses.fields(online.Setup):
-        if field.name not in ("inferences", "replay") and field.default is not dataclasses.MISSING:
+        if field.name not in ("inferences", "replay", "calibrations") and field.default is not dataclasses.MISSING:
             assert getattr(settings, field.name) == field.default, field.name
     assert INFERENCES[settings.scheme] == online.Setup.inferences
     assert settings.proposal == inspect.signature(online.Setup.create).parameters["proposal"].default
