@@ -58,10 +58,10 @@ class MixtureDensity:
     """Encoder and mixture head, trained jointly; an ensemble of them; evidence of a set; recalibration.
 
     The networks learn q(θ | one recording). With few simulations a single network is over-confident: several, each with
-    another fold held out to stop it early, are averaged. The posterior of a set is the product of the evidence of its
-    recordings (`combine_evidence`). What is still wrong with it, above all the error that the network makes at one θ
-    for every recording alike and that a product takes for evidence, is measured on simulated sets of the same size that
-    no network was trained on, and taken out (`recalibrate`).
+    another fold held out to stop it early, are averaged. The evidence of several recordings adds up to a Gaussian
+    (`combine_evidence`) that counts the error that networks make at one θ for every recording alike as often as there
+    are recordings; the posterior given it is learned from simulated sets of the same size that these networks were not
+    trained on (`read_sets`). That of a single recording is their mixture, moved and stretched (`recalibrate`).
 
     θ is standardized by the weighted mean and standard deviation of each fit's pairs; the head's last layer is
     rewritten for the new units, so warm weights keep their meaning.
@@ -153,7 +153,8 @@ class MixtureDensity:
     ) -> tuple[EstimatorState, CalibrationInfo]:
         """Measure the posterior of sets on sets that no network has seen, and take out what is wrong with it.
 
-        The half of them whose posteriors sit nearest that of the set observed counts, the nearest most.
+        In what is reported the half of them whose posteriors sit nearest that of the set observed counts, the nearest
+        most; and in the correction, where it is that of single recordings.
         """
         z = (thetas - state.shift) / state.scale
         every = jax.tree.map(lambda leaf, one: jnp.concatenate([leaf, one[None]]), recordings, observed)
