@@ -24,6 +24,7 @@ __all__ = [
     "decide",
     "error_left",
     "explains",
+    "falls_short",
     "has_special_case",
     "is_outdone",
     "is_worth",
@@ -82,6 +83,8 @@ class Thresholds:
     """The same product, above which an effect explains nothing, though no misfit of pieces can be detected."""
     foreseen: float = 0.003
     """Share of the baseline's error of predictions ahead, below which what pieces leave is the sensors' own."""
+    chief: float = 0.03
+    """The same for one effect by which all but a rest is foreseen, that no set of candidates explains."""
     enough: float = 0.015
     """Share that effects may leave before larger sets are tried."""
     doubtful: float = 0.1
@@ -98,6 +101,10 @@ class Thresholds:
     """Nats in all by which a candidate has to be worse to be out of the confusion set."""
     ceiling: float = 0.9
     """Share of what a force without a name gains on recordings left out that an answer has to gain there."""
+    held: float = 0.05
+    """Share of the baseline's squared error beyond noise that an answer may leave on recordings left out."""
+    visible: float = 4.0
+    """Times what noise allows, from which what is left there counts."""
     coincidence: float = 5.0
     """Nats by which its numbers may be a greater coincidence than another's that does as well."""
 
@@ -154,17 +161,18 @@ class Diagnosis:
     """Of every set in the confusion set."""
     screened: list[tuple[str, float]] = field(default_factory=list)
     """Every candidate and how much it gained on the windows it was fitted to."""
-    outdone: bool = False
-    """Whether an answer was taken back because a force without a name predicts recordings left out far better."""
+    taken_back: Entry | None = None
+    """An answer that was taken back, since it predicts recordings left out too badly."""
 
     def take_back(self) -> None:
         """Leave the misfit unexplained by what had been found."""
-        self.verdict, self.outdone, self.confusion, self.probabilities = "unexplained", True, [], []
+        self.verdict, self.taken_back, self.confusion, self.probabilities = "unexplained", self.best, [], []
 
     @property
     def best(self) -> Entry:
-        """What the verdict names, or the best there was."""
-        return self.confusion[0] if self.confusion else self.entries[0] if self.entries else self.baseline
+        """What the verdict names, or had named, or the best there was."""
+        best = self.confusion[0] if self.confusion else self.taken_back
+        return best or (self.entries[0] if self.entries else self.baseline)
 
 
 def share_left(after: Misfit, before: Misfit) -> float:
@@ -230,6 +238,7 @@ def decide(
     # what more effects explain has to be worth them: another law of the same effect leaves a rest, too
     tied += [entry for entry in entries if entry not in tied and _suffices(entry, tied, none, thresholds)]
     tied = [entry for entry in tied if explains(entry, none, thresholds) and is_worth(entry, entries, none, thresholds)]
+    tied = tied or _find_chief(entries, none, thresholds)
     if not tied:
         return result
     if any(not entry.names for entry in tied):
@@ -266,6 +275,22 @@ def explains(entry: Entry, none: Entry, thresholds: Thresholds) -> bool:
     return left <= thresholds.left and not (entry.ahead > thresholds.ahead or left * entry.ahead > both)
 
 
+def _find_chief(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> list[Entry]:
+    """The best effect by itself, and what ties with it, where predictions ahead leave next to nothing to explain.
+
+    Precise sensors show in short pieces what a machine has besides, and what they do themselves: that rest must not be
+    what any other candidate explains. Effects with a memory are excused where their past is unknown, and are left out.
+    """
+    alone = [entry for entry in entries if len(entry.names) == 1]
+    if not alone:
+        return []
+    rest = thresholds.worth * share_left(alone[0].misfit, none.misfit)
+    if any(share_left(entry.misfit, none.misfit) <= rest for entry in entries):
+        return []
+    tied = [entry for entry in alone if ties(entry, alone[0], none, thresholds)]
+    return tied if all(e.ahead <= thresholds.chief and e.misfit.judged.all() for e in tied) else []
+
+
 def is_outdone(
     baseline: Errors, answer: Errors, flexible: Errors, scale: Float[np.ndarray, " obs"], thresholds: Thresholds
 ) -> bool:
@@ -289,14 +314,16 @@ def is_outdone(
     return bool(sure and was - now < thresholds.ceiling * (was - best))
 
 
+def falls_short(baseline: float, answer: float, floor: float, thresholds: Thresholds) -> bool:
+    """Whether an answer leaves much of the error on recordings left out; errors as `nrmse`, `floor` of noise alone."""
+    left = max(answer**2 - floor**2, 0.0) / max(baseline**2 - floor**2, 1e-12)
+    return answer > thresholds.visible * floor and left > thresholds.held
+
+
 def _suffices(entry: Entry, tied: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:
     """Whether a candidate explains the misfit, and those that tie for the best add effects to it without much gain."""
-    if not explains(entry, none, thresholds):
-        return False
-    left = share_left(entry.misfit, none.misfit)
-    return all(
-        set(entry.names) < set(other.names) and share_left(other.misfit, none.misfit) > thresholds.worth * left
-        for other in tied
+    return explains(entry, none, thresholds) and all(
+        set(entry.names) < set(other.names) and not _leaves_less(other, entry, none, thresholds) for other in tied
     )
 
 
@@ -306,10 +333,14 @@ def is_worth(entry: Entry, entries: Sequence[Entry], none: Entry, thresholds: Th
     A little less is what any further effect leaves.
     """
     parts = [other for other in entries if set(other.names) < set(entry.names)]
-    left = share_left(entry.misfit, none.misfit)
-    return all(
-        left <= thresholds.worth * share_left(part.misfit, none.misfit) and entry.score >= part.score for part in parts
-    )
+    return all(_leaves_less(entry, part, none, thresholds) and entry.score >= part.score for part in parts)
+
+
+def _leaves_less(entry: Entry, part: Entry, none: Entry, thresholds: Thresholds) -> bool:
+    """Of the misfit of pieces, or, where the part leaves much of the error ahead, of both."""
+    mine, its = share_left(entry.misfit, none.misfit), share_left(part.misfit, none.misfit)
+    both = part.ahead > thresholds.doubtful and mine * entry.ahead <= thresholds.worth * its * part.ahead
+    return mine <= thresholds.worth * its or both
 
 
 def ties(entry: Entry, best: Entry, none: Entry, thresholds: Thresholds) -> bool:

@@ -161,16 +161,20 @@ class MixtureDensity:
         plain, seen = _last(jax.lax.map(lambda one: self._plain(state, one, use), every))
         weights = nearness(plain, seen)
         low, high = ((bound - state.shift) / state.scale for bound in (box.low, box.high))
-        before = credible_levels(key, plain, z, low, high, jnp.ones(1))[:, 0]
+
+        def levels(held: int) -> Float[Array, " held"]:
+            first, truths = jax.tree.map(lambda leaf: leaf[:held], (plain, z))
+            return credible_levels(key, first, truths, low, high, jnp.ones(1))[:, 0]
+
         if not correct:
+            before = levels(z.shape[0])
             return state, judge(before, before, weights, z.shape[1], jnp.ones(()))
         if isinstance(state.correction, Readout):
             correction, after = read_sets(key, plain, z, low, high)
         else:
             correction, after = recalibrate(key, plain, z, weights, low, high)
-        held = after.size
         widen = _width(correction.apply(seen)) / _width(seen)
-        info = judge(before[:held], after, by_number(weights[:held]), z.shape[1], widen)
+        info = judge(levels(after.size), after, by_number(weights[: after.size]), z.shape[1], widen)
         return replace(state, correction=correction), info
 
     def posterior(self, state: EstimatorState, recordings: Recording, use: Bool[Array, " set"]) -> GaussianMixture:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -23,10 +23,10 @@ from bayessim_jax.diagnosis.procedure import Problem, detect, is_mismatch, name_
 from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.diagnosis.screen import Screened
 from bayessim_jax.diagnosis.simulated_scene import SimulatedScene
-from bayessim_jax.diagnosis.verdict import Diagnosis, Entry, Thresholds, is_outdone, share_left
+from bayessim_jax.diagnosis.verdict import Diagnosis, Entry, Thresholds, falls_short, is_outdone, share_left
 from bayessim_jax.effects import EFFECTS, Scales, commanded_scales, effect_places, recorded_scales
 from bayessim_jax.inference.replay import Restarted
-from bayessim_jax.inference.scores import Score, compare, error_spread, score
+from bayessim_jax.inference.scores import Errors, Score, compare, error_spread, score
 from bayessim_jax.inference.shooting import Shots
 from bayessim_jax.recordings.experiments import advise, next_experiment
 from bayessim_jax.recordings.identification import channel_scale, start_spread
@@ -293,10 +293,9 @@ def diagnose_case(
         spreads[which] = error_spread(compare(predicted[chosen], y[chosen], measured[chosen]), scale)
         judging[which] = compare(predicted[~chosen], y[~chosen], measured[~chosen])
         scores[which] = score(judging[which], spreads[which], scale, bench.channels)
-    if result.confusion and "flexible" in judging:
-        before, answer, free = (judging[which] for which in ("baseline", "augmented", "flexible"))
-        if is_outdone(before, answer, free, scale, thresholds or Thresholds()):
-            result.take_back()
+    floor = _floor(bench, result.best, scale, model, shots)
+    if result.confusion and _is_refuted(judging, scores, floor, scale, thresholds or Thresholds()):
+        result.take_back()
     named = result.verdict != "no_mismatch"
     return CaseDiagnosis(
         model=model,
@@ -313,7 +312,7 @@ def diagnose_case(
         spreads=spreads,
         predictions=predictions,
         scale=scale,
-        noise_floor=_floor(bench, result.best, scale, model, shots),
+        noise_floor=floor,
         theta={
             "baseline": moments_of_theta(bench, [result.baseline], [1.0]),
             "augmented": moments_of_theta(bench, result.confusion or [result.best], result.probabilities or [1.0]),
@@ -321,6 +320,17 @@ def diagnose_case(
         experiment=next_experiment(model, bench, result, shots),
         absorbed=_absorbed(taken.problem, none),
     )
+
+
+def _is_refuted(
+    judging: Mapping[str, Errors], scores: Mapping[str, Score], floor: float, scale: np.ndarray, thresholds: Thresholds
+) -> bool:
+    """Whether recordings left out contradict an answer."""
+    if falls_short(scores["baseline"].nrmse, scores["augmented"].nrmse, floor, thresholds):
+        return True
+    if "flexible" not in judging:
+        return False
+    return is_outdone(judging["baseline"], judging["augmented"], judging["flexible"], scale, thresholds)
 
 
 def _absorbed(problem: Problem, none: Entry) -> list[str]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_jax.diagnosis.verdict import share_left
+from bayessim_jax.diagnosis.verdict import Thresholds, share_left
 from bayessim_jax.recordings.diagnosing import CaseDiagnosis
 from bayessim_jax.recordings.experiments import advise
 from bayessim_jax.report import html
@@ -44,15 +44,17 @@ def headline(diagnosis: CaseDiagnosis) -> str:
     if result.verdict == "unexplained":
         sentence = f"Something is missing at {where or 'no single joint'}, and none of the candidates explains it."
         if result.entries:
-            best = result.entries[0]
+            best, floor = result.taken_back or result.entries[0], number(100 * diagnosis.noise_floor)
             left = number(100 * share_left(best.misfit, result.baseline.misfit))
             sentence += f" The closest, {best.title}, leaves {left} % of the misfit"
-            flexible = diagnosis.scores["flexible"].nrmse if result.outdone else 0.0
-            beyond = (
-                f", but a force without a name predicts better: {held} it misses by {number(100 * flexible)} % of a"
+            if not result.taken_back:
+                return f"{sentence}."
+            sentence += (
+                f", but does not hold on recordings left out: predictions {horizon:g} s ahead miss there by "
+                f"{number(100 * after)} % of a channel's spread, where noise allows {floor} %"
             )
-            beyond += f" channel's spread, and the candidate by {number(100 * after)} %."
-            sentence += beyond if result.outdone else "."
+            free = diagnosis.scores.get("flexible")
+            sentence += f" and a force without a name reaches {number(100 * free.nrmse)} %." if free else "."
         return sentence
     change = f"{held} miss by {number(100 * after)} % of a channel's spread instead of {number(100 * before)} %"
     if result.verdict == "ambiguous":
@@ -64,7 +66,9 @@ def headline(diagnosis: CaseDiagnosis) -> str:
             f"{name} {plus_minus(p['mean'], p['sd'], p['unit'])}" for name, p in effect["parameters"].items()
         )
         parts.append(f"{effect['effect']} at {effect['at']} ({values})")
-    return f"Missing is {' and '.join(parts)}: {change}."
+    left = share_left(result.best.misfit, result.baseline.misfit)
+    rest = f" Short pieces show {number(100 * left)} % of the misfit still, which no candidate explains."
+    return f"Missing is {' and '.join(parts)}: {change}.{rest if left > Thresholds().left else ''}"
 
 
 def render(diagnosis: CaseDiagnosis, facts: Mapping[str, Any]) -> str:

@@ -5,7 +5,16 @@ import pytest
 
 from bayessim_jax.diagnosis.bench import Candidate
 from bayessim_jax.diagnosis.procedure import _is_too_narrow
-from bayessim_jax.diagnosis.verdict import Entry, Thresholds, are_kin, decide, error_left, is_outdone, may_be_named
+from bayessim_jax.diagnosis.verdict import (
+    Entry,
+    Thresholds,
+    are_kin,
+    decide,
+    error_left,
+    falls_short,
+    is_outdone,
+    may_be_named,
+)
 from bayessim_jax.diagnosis.whiteness import Misfit
 from bayessim_jax.inference.scores import Errors
 from bayessim_jax.inference.shooting import Shots
@@ -59,6 +68,19 @@ def test_an_answer_that_a_force_without_a_name_outdoes_is_taken_back(answer, fle
     assert found.verdict == "unexplained" and found.best.names == ["a@x"] and found.confusion == []
 
 
+@pytest.mark.parametrize(
+    ("baseline", "answer", "floor", "wanted"),
+    [
+        (0.9, 0.4, 0.07, True),
+        (0.9, 0.15, 0.07, False),  # a thirtieth of the squared error
+        (0.05, 0.02, 0.01, False),  # near what noise allows
+        (0.9, float("nan"), 0.07, False),  # nothing was left out
+    ],
+)
+def test_an_answer_that_leaves_much_error_on_recordings_left_out_is_taken_back(baseline, answer, floor, wanted):
+    assert falls_short(baseline, answer, floor, Thresholds()) == wanted
+
+
 def test_candidates_that_predict_alike_are_a_confusion_set():
     found = verdict(entry(["a@x"], 100.0, 0.002), entry(["b@x"], 100.0, 0.002, seed=1))
     assert found.verdict == "ambiguous"
@@ -94,6 +116,39 @@ def test_what_leaves_the_misfit_explains_nothing():
     assert verdict().verdict == "unexplained"
 
 
+def ahead(found, share, judged=True):
+    """An entry that leaves a share of the error of predictions ahead."""
+    found.ahead = share
+    found.misfit = dataclasses.replace(found.misfit, judged=np.arange(WINDOWS) >= (0 if judged else 5))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("share", "judged", "other", "wanted"),
+    [
+        (0.02, True, 0.19, "explained"),
+        (0.05, True, 0.19, "unexplained"),  # predictions miss something, too
+        (0.02, False, 0.19, "unexplained"),  # excused for what it may remember
+        (0.02, True, 0.05, "unexplained"),  # another candidate explains the rest of pieces
+        (float("nan"), True, 0.19, "unexplained"),
+    ],
+)
+def test_one_effect_by_which_all_but_a_rest_is_foreseen_is_named(share, judged, other, wanted):
+    alone, pair = ahead(entry(["a@x"], 100.0, 0.2), share, judged), entry(["a@x", "b@x"], 120.0, other)
+    found = verdict(pair, alone, entry(["c@x"], 60.0, 0.3, seed=1))
+    assert found.verdict == wanted
+    if wanted == "explained":
+        assert found.best.names == ["a@x"]
+        assert found.probabilities[0] < 0.8, "the rest counts against it"
+
+
+def test_two_effects_that_foresee_alike_but_for_a_rest_are_a_confusion_set():
+    pair = entry(["a@x", "b@x"], 120.0, 0.19)
+    found = verdict(pair, *(ahead(entry([name], 100.0, 0.2, seed=k), 0.02) for k, name in enumerate(["a@x", "c@x"])))
+    assert found.verdict == "ambiguous"
+    assert {tuple(e.names) for e in found.confusion} == {("a@x",), ("c@x",)}
+
+
 def test_what_explains_pieces_and_predicts_no_better_explains_nothing():
     found = entry(["a@x"], 100.0, 0.002)
     for ahead, wanted in ((0.95, "unexplained"), (0.2, "explained")):
@@ -104,7 +159,7 @@ def test_what_explains_pieces_and_predicts_no_better_explains_nothing():
         some.ahead = ahead
         assert verdict(some).verdict == wanted
     rough = entry(["a@x"], 100.0, 0.3)
-    for ahead, wanted in ((0.002, "explained"), (0.02, "unexplained")):
+    for ahead, wanted in ((0.002, "explained"), (0.05, "unexplained")):
         rough.ahead = ahead
         assert verdict(rough).verdict == wanted
 
@@ -192,6 +247,12 @@ def test_more_effects_have_to_be_worth_it():
     assert verdict(entry(["a@x"], 100.0, 0.2), small).best.names == ["a@x", "b@y"]
     assert verdict(single, entry(["a@x", "b@y"], 100.0, 0.025)).best.names == ["a@x"]
     assert verdict(entry(["a@x"], 100.0, 0.05), entry(["a@x", "b@y"], 120.0, 0.025)).verdict == "unexplained"
+
+
+@pytest.mark.parametrize(("part", "both", "wanted"), [(0.25, 0.1, ["a@x", "b@x"]), (0.05, 0.02, ["a@x"])])
+def test_where_predictions_still_miss_much_another_effect_is_worth_what_it_gains_there(part, both, wanted):
+    alone, pair = ahead(entry(["a@x"], 100.0, 0.001), part), ahead(entry(["a@x", "b@x"], 150.0, 0.0005), both)
+    assert verdict(pair, alone).best.names == wanted
 
 
 def test_a_set_that_wins_in_few_recordings_is_less_probable():

@@ -82,3 +82,47 @@ def test_the_geometry_of_a_real_vehicle_predicts_windows_that_were_left_out(name
     assert found["fit"]["posterior"]["nrmse"] < 0.8 * found["fit"]["baseline"]["nrmse"]
     assert set(found["parameters"]) == {"wheel_radius", "axial_distance", "icr_offset"}
     assert found["parameters"]["axial_distance"]["mean"] > 1.4
+
+
+DRY = {"coulomb_friction", "stribeck_friction", "asymmetric_friction", "load_dependent_friction", "lugre_friction"}
+
+
+def diagnosed(name, tmp_path):
+    """What `bayessim diagnose` says of a rig, and the sets that it cannot tell apart, each as {(effect, place), …}."""
+    assert main(["diagnose", str(CASES / name), "--out", str(tmp_path / "run"), "--quiet"]) == 0
+    table = json.loads((tmp_path / "run" / "diagnosis.json").read_text())
+    best = [f"{e['effect']}@{e['at']}" for e in table["effects"]]
+    return table, [{tuple(n.split("@", 1)) for n in names} for names in table["confusion_set"] or [best]]
+
+
+def shrinks(table, share):
+    """Whether the error on recordings left out is at most a share of what it was."""
+    return table["fit"]["augmented"]["nrmse"] <= share * table["fit"]["baseline"]["nrmse"]
+
+
+@pytest.mark.slow
+def test_a_free_arm_lacks_viscous_friction_and_no_dry_one(tmp_path):
+    table, sets = diagnosed("multiarm_single", tmp_path)
+    assert sets[0] == {("viscous_friction", "joint/hinge")}
+    assert not any(effect in DRY for names in sets for effect, _ in names)
+    assert shrinks(table, 0.25)
+
+
+@pytest.mark.slow
+def test_a_rail_lacks_viscous_friction_and_dry_friction_with_two_levels(tmp_path):
+    table, sets = diagnosed("emps", tmp_path)
+    assert {("viscous_friction", "joint/rail"), ("asymmetric_friction", "joint/rail")} in sets
+    assert all(("asymmetric_friction", "joint/rail") in names for names in sets)
+    found = {(e["effect"], name): p["mean"] for e in table["effects"] for name, p in e["parameters"].items()}
+    assert found.get(("viscous_friction", "viscous"), 203.5) == pytest.approx(203.5, rel=0.1)  # the authors' value
+    assert shrinks(table, 0.06)
+
+
+@pytest.mark.slow
+def test_geared_joints_lack_dry_friction_and_a_rotor(tmp_path):
+    table, sets = diagnosed("dfki_double_pendulum", tmp_path)
+    for names in sets:
+        assert {place for effect, place in names if effect in DRY} == {"joint/shoulder", "joint/elbow"}
+        assert {effect for effect, _ in names} <= DRY | {"armature"}
+    assert any(effect == "armature" for names in sets for effect, _ in names)
+    assert shrinks(table, 0.25)
