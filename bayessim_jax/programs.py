@@ -1,11 +1,12 @@
 """Programs that are traced once for all processes, not once in each.
 
 JAX's compilation cache keeps what XLA made of a program; to find it there, every process traces and lowers the program
-again, which for a robot in a loop over time steps takes seconds of Python. `trace_once` keeps what tracing led to, as
-StableHLO of `jax.export`, under a name that is made of everything the trace depends on: the package's own code, the
-versions of what it stands on, static arguments, and shapes of the others. What has no such name, a function from
-elsewhere for instance, is traced as ever. Nothing is kept until `keep_traces_in` says where; nothing in these files is
-run but by XLA, and a file that cannot be read is made again.
+again, which for a robot in a loop over time steps takes seconds of Python. `trace_once` and `compile_once` keep what
+tracing led to, as StableHLO of `jax.export` beside the structure of what is returned, under a name that is made of
+everything the trace depends on: the package's own code, the versions of what it stands on, static arguments, and the
+structure and shapes of the others. What has no such name, a function from elsewhere for instance, is traced as ever.
+Nothing is kept until `keep_traces_in` says where; nothing in these files is run but by XLA, the only names read from
+them are those of the package's own containers, and a file that cannot be read is made again.
 """
 
 from __future__ import annotations
@@ -13,8 +14,10 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+import importlib
 import importlib.metadata
 import inspect
+import json
 import struct
 import sys
 import tempfile
@@ -28,11 +31,12 @@ import mujoco
 import numpy as np
 from jax import export
 from jax.core import Tracer
+from jax.tree_util import PyTreeDef, default_registry
 
-__all__ = ["Unnamed", "keep_traces_in", "name_of", "trace_once"]
+__all__ = ["Unnamed", "compile_once", "keep_traces_in", "name_of", "trace_once"]
 
 PACKAGE = __package__ or "bayessim_jax"
-STANDS_ON = ("jax", "jaxlib", "flax", "mujoco", "numpy")
+STANDS_ON = ("jax", "jaxlib", "flax", "optax", "distrax", "mujoco", "numpy")
 SETTINGS = (
     "enable_x64",
     "default_matmul_precision",
@@ -62,9 +66,9 @@ def trace_once(
     compiler_options: Mapping[str, Any] | None = None,
     to_numpy: bool = False,
 ) -> Any:
-    """`jax.jit` of a function whose trace is kept where `keep_traces_in` says. It returns arrays in tuples or lists.
+    """`jax.jit` of a function whose trace is kept where `keep_traces_in` says.
 
-    With `to_numpy` it returns NumPy's, for what is put together on the host.
+    With `to_numpy` it returns NumPy's arrays, for what is put together on the host.
     """
     if function is None:
         return functools.partial(
@@ -109,6 +113,23 @@ def _kind(x: Any) -> tuple[Any, ...]:
     return np.shape(x), jax.dtypes.result_type(x), _is_weak(x)
 
 
+def compile_once(
+    function: Callable[..., Any], *args: Any, compiler_options: Mapping[str, Any] | None = None
+) -> Callable[..., Any]:
+    """The compiled program of a function of pytrees for arguments like these, its trace kept as by `trace_once`.
+
+    Arguments may be shapes in place of arrays.
+    """
+    options: Any = dict(compiler_options) if compiler_options else None
+    leaves, structure = jax.tree.flatten(args)
+    kept = _keep(_folder, function, function, (), leaves, structure) if _folder is not None else None
+    if kept is None:
+        return jax.jit(function, compiler_options=options).lower(*args).compile()
+    exported, returned = kept
+    program = jax.jit(_naming(exported.call, function), compiler_options=options).lower(*leaves).compile()
+    return lambda *args: jax.tree.unflatten(returned, program(*jax.tree.leaves(args)))
+
+
 def _find(
     folder: Path,
     function: Callable[..., Any],
@@ -118,30 +139,120 @@ def _find(
     options: Any,
 ) -> Callable[..., Any] | None:
     """The program from the disk, or traced and put there; None where it has no name or cannot be kept."""
-    kinds = tuple((np.shape(x), jax.dtypes.result_type(x), _is_weak(x)) for x in leaves)
+    kept = _keep(folder, function, lambda **given: function(**given, **fixed), fixed, leaves, structure)
+    if kept is None:
+        return None
+    exported, returned = kept
+    program = jax.jit(_naming(exported.call, function), compiler_options=options)
+    return lambda *leaves: jax.tree.unflatten(returned, program(*leaves))
+
+
+def _naming(call: Callable[..., Any], function: Callable[..., Any]) -> Callable[..., Any]:
+    """A call that is named as a function is."""
+
+    def run(*leaves: Any) -> Any:
+        return call(*leaves)
+
+    run.__name__ = function.__name__
+    return run
+
+
+def _keep(
+    folder: Path,
+    function: Callable[..., Any],
+    applied: Callable[..., Any],
+    fixed: Any,
+    leaves: Sequence[Any],
+    structure: Any,
+) -> tuple[Any, Any] | None:
+    """A function of leaves as it was exported, and the structure of what it returns, from the disk or put there.
+
+    `applied` is the function of what `structure` makes of the leaves, a dictionary or a tuple.
+    """
+    kinds = tuple((np.shape(x), _dtype(x), _is_weak(x)) for x in leaves)
     backend, settings = jax.default_backend(), [getattr(jax.config, f"jax_{name}") for name in SETTINGS]
     try:
         path = folder / name_of((_standing(), backend, settings, function, fixed, structure, kinds))
     except Unnamed:
         return None
-    exported = _read(path)
-    if exported is None:
+    kept = _read(path, structure)
+    if kept is None:
+        found: list[Any] = []
 
         def flat(*leaves: Any) -> Any:
-            return function(**jax.tree.unflatten(structure, leaves), **fixed)
+            given = jax.tree.unflatten(structure, leaves)
+            returned = applied(**given) if isinstance(given, dict) else applied(*given)
+            found[:] = [jax.tree.structure(returned)]
+            return jax.tree.leaves(returned)
 
         try:
             exported = export.export(jax.jit(flat))(*leaves)
-            content = bytes(exported.serialize())
-        except (NotImplementedError, ValueError):
-            return None  # a call into Python, which no file can hold
+            head = json.dumps(_describe(found[0], structure)).encode()
+            content = struct.pack("<Q", len(head)) + head + bytes(exported.serialize())
+        except (NotImplementedError, ValueError, Unnamed):
+            return None  # a call into Python, which no file can hold, or a container of others
         _write(path, content)
+        kept = exported, found[0]
+    return kept
 
-    def run(*leaves: Any) -> Any:
-        return exported.call(*leaves)
 
-    run.__name__ = function.__name__
-    return jax.jit(run, compiler_options=options)
+def _describe(structure: Any, given: Any) -> Any:
+    """A structure as JSON: `*` for a leaf, the number of the same part of `given`, or type, data and parts."""
+    node = structure.node_data()
+    if node is None:
+        return "*"
+    alike = [k for k, part in enumerate(given.children()) if _is_same(part, structure)]
+    if alike:
+        return alike[0]
+    kind, data = node
+    return [_place(kind).decode().rstrip(";"), _as_json(data), [_describe(c, given) for c in structure.children()]]
+
+
+def _is_same(one: Any, other: Any) -> bool:
+    """Whether two structures have the same types; JAX takes dataclasses with as many fields for equal."""
+    parts = one.children(), other.children()
+    alike = one.node_data() == other.node_data() and len(parts[0]) == len(parts[1])
+    return alike and all(map(_is_same, *parts))
+
+
+def _as_json(data: Any) -> Any:
+    """Static data of words and numbers; tuples are lists in a dictionary."""
+    if isinstance(data, tuple):
+        return {"tuple": [_as_json(each) for each in data]}
+    if isinstance(data, list):
+        return [_as_json(each) for each in data]
+    if data is None or isinstance(data, (bool, int, float, str)):
+        return data
+    raise Unnamed(repr(data))
+
+
+def _rebuild(told: Any, given: Any) -> Any:
+    """The structure that `_describe` told."""
+    if isinstance(told, int):
+        return given.children()[told]
+    if told == "*":
+        return jax.tree.structure(0)
+    name, data, parts = told
+    children = [_rebuild(part, given) for part in parts]
+    node = _container(name), _from_json(data)
+    return PyTreeDef.from_node_data_and_children(default_registry, node, children)
+
+
+def _from_json(data: Any) -> Any:
+    if isinstance(data, dict):
+        return tuple(_from_json(each) for each in data["tuple"])
+    return [_from_json(each) for each in data] if isinstance(data, list) else data
+
+
+def _container(name: str) -> type:
+    """A class of the package, or of Python's own containers."""
+    plain = {f"builtins.{kind.__name__}": kind for kind in (tuple, list, dict, type(None))}
+    if name in plain:
+        return plain[name]
+    module, _, last = name.rpartition(".")
+    if module.partition(".")[0] != PACKAGE or module not in sys.modules:
+        raise ValueError(f"{name} is no container of this package")
+    return getattr(importlib.import_module(module), last)
 
 
 def _untie(x: Any) -> Any:
@@ -152,16 +263,23 @@ def _untie(x: Any) -> Any:
     return jax.device_put(np.asarray(x))
 
 
+def _dtype(x: Any) -> str:
+    """What kind of number, or of key, an argument is."""
+    return str(x.dtype if hasattr(x, "dtype") else jax.dtypes.result_type(x))
+
+
 def _is_weak(x: Any) -> bool:
     """Whether a number takes the precision of those that it meets."""
     return bool(getattr(x, "weak_type", isinstance(x, (bool, int, float, complex)) and not isinstance(x, np.generic)))
 
 
-def _read(path: Path) -> Any:
+def _read(path: Path, given: Any) -> Any:
     """What a file holds; None where there is none, or none that can be read."""
     try:
         content = path.read_bytes()
-        return export.deserialize(bytearray(content))
+        (size,) = struct.unpack_from("<Q", content)
+        told = json.loads(content[8 : 8 + size])
+        return export.deserialize(bytearray(content[8 + size :])), _rebuild(told, given)
     except Exception:
         return None
 
@@ -230,6 +348,8 @@ def _feed(put: Callable[[bytes], None], x: Any) -> None:
         if x.__closure__:
             raise Unnamed(repr(x))
         piece(_place(x))
+    elif callable(x) and hasattr(x, "__wrapped__"):
+        piece(_place(x))  # a function of JAX's own, jitted
     else:
         _feed_object(put, x)
 
@@ -260,9 +380,9 @@ def _content(x: Any) -> bytes:
 
 
 def _place(x: Any) -> bytes:
-    """Where a class or function of the package, of Python or of NumPy stands."""
+    """Where a class or function stands, of the package, of Python, or of what it stands on."""
     module = x.__module__ or ""
     root = module.partition(".")[0]
-    if root not in (PACKAGE, "builtins", "numpy") or "<" in x.__qualname__:
+    if root not in (PACKAGE, "builtins", *STANDS_ON) or "<" in x.__qualname__:
         raise Unnamed(repr(x))
     return f"{module}.{x.__qualname__};".encode()

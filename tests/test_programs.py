@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from bayessim_jax.beliefs.margins import Margins, uniform
+from bayessim_jax.contracts import Box
 from bayessim_jax.diagnosis.bench import Simulator
 from bayessim_jax.effects import EFFECTS, Scales
+from bayessim_jax.inference.fit import FitInfo
 from bayessim_jax.inference.replay import Replay
-from bayessim_jax.programs import Unnamed, keep_traces_in, name_of, trace_once
+from bayessim_jax.programs import Unnamed, compile_once, keep_traces_in, name_of, trace_once
 from bayessim_jax.systems.mjcf import Unknown, mjcf_system
 
 MODEL = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body>
@@ -135,3 +137,37 @@ def test_pieces_do_not_run_into_each_other():
     values = [("ab", "c"), ("a", "bc"), ["ab", "c"], (1, 2.0), (1.0, 2), (True, 2), (("ab",), "c"), {"ab": "c"}, None]
     assert len({name_of(value) for value in values}) == len(values)
     assert name_of(np.zeros(4)) != name_of(np.zeros((2, 2))) != name_of(np.zeros(4, np.float32))
+
+
+def kept_pair(x, state):
+    """What a round returns: a state as it came, and containers of the package's own."""
+    TRACED.append(1)
+    info = FitInfo(*(x.sum() * k for k in range(6)))
+    return {**state, "a": state["a"] + 1}, (info, Box(x, x + 1, ("one",), ("m",)))
+
+
+kept_pair.__module__ = "bayessim_jax.elsewhere"
+
+
+def test_a_program_is_compiled_from_a_trace_on_the_disk_and_returns_what_it_did(folder):
+    given = jnp.ones(1), {"a": jnp.zeros(2), "f": jnp.ones(3)}
+    first = compile_once(kept_pair, *given)(*given)
+    again = compile_once(kept_pair, *jax.eval_shape(lambda *x: x, *given))(*given)
+    assert TRACED == [1]
+    assert type(again[1][0]) is FitInfo and again[1][1].names == ("one",)
+    for a, b, c in zip(*map(jax.tree.leaves, (first, again, kept_pair(*given))), strict=True):
+        np.testing.assert_array_equal(a, b)
+        np.testing.assert_array_equal(a, c)
+
+
+def test_no_class_from_elsewhere_is_taken_from_a_file(folder):
+    given = jnp.ones(1), {"a": jnp.zeros(2), "f": jnp.ones(3)}
+    compile_once(kept_pair, *given)
+    (file,) = folder.iterdir()
+    whole = file.read_bytes()
+    ours, theirs = b"bayessim_jax.inference.fit.FitInfo", b"collections.abc.defaultdict1234567"
+    assert len(ours) == len(theirs) and whole.count(ours) == 1
+    file.write_bytes(whole.replace(ours, theirs))
+    compile_once(kept_pair, *given)
+    assert TRACED == [1, 1]
+    assert ours in file.read_bytes()

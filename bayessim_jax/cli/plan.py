@@ -26,6 +26,7 @@ from bayessim_jax.engines.simulated import SimulatedTarget
 from bayessim_jax.inference.encoders import features_of
 from bayessim_jax.inference.estimators import fourier_mixture, recurrent_mixture, summary_mixture
 from bayessim_jax.inference.fit import Schedule
+from bayessim_jax.programs import compile_once
 from bayessim_jax.recordings.truths import Truths
 from bayessim_jax.spelling import find_named, near_miss
 
@@ -84,7 +85,7 @@ class Plan:
         """One round of all seeds as compiled functions of their states, the same round that `online.run` does.
 
         What calls the target on the host is apart from what only computes, because programs with callbacks are not
-        kept by the persistent compilation cache.
+        kept by the persistent compilation cache, and their traces are not kept either.
         """
         setup, thetas = self.setup, jax.numpy.asarray(self.hidden.at(1))
         keys = jax.vmap(online.split)(self.keys)
@@ -93,28 +94,27 @@ class Plan:
             one = lambda k, theta, state: online.record(k, setup, self.target.replace(theta=theta), state)  # noqa: E731
             return _over_seeds(one, len(self.seeds))(keys, thetas, states)
 
-        def update(setup: online.Setup, keys: Any, states: Any, recordings: Any) -> Any:
-            one = lambda k, state, seen: online.update(k, setup, state, seen)  # noqa: E731
-            return _over_seeds(one, len(self.seeds))(keys, states, recordings)
-
-        def improve(setup: online.Setup, keys: Any, states: Any) -> Any:
-            one = lambda k, state: online.improve(k, setup, state)  # noqa: E731
-            return _over_seeds(one, len(self.seeds))(keys, states)
-
         def evaluate(setup: online.Setup, keys: Any, thetas: Any, states: Any) -> Any:
             one = lambda k, theta, state: online.evaluate(k, setup, self.target.replace(theta=theta), state)  # noqa: E731
             return _over_seeds(one, len(self.seeds))(keys, thetas, states)
 
-        seen = jax.eval_shape(record, setup, keys.record, thetas, states)
-        build = lambda f, *args: jax.jit(f, compiler_options=online.COMPILER_OPTIONS).lower(*args)  # noqa: E731
+        def of_a_round(leaf: jax.Array) -> jax.ShapeDtypeStruct:
+            return jax.ShapeDtypeStruct((len(self.seeds), setup.recordings, *leaf.shape[2:]), leaf.dtype)
+
+        seen = jax.tree.map(of_a_round, states.history)
+        options = online.COMPILER_OPTIONS
+        build = lambda f, *args: jax.jit(f, compiler_options=options).lower(*args)  # noqa: E731
         rounds = {bool(online.infers(setup, r)) for r in range(self.settings.rounds)}
         with ThreadPoolExecutor() as pool:  # the others are compiled while the last is traced
             evaluator = pool.submit(build(evaluate, setup, keys.evaluate, thetas, states).compile)
             recorder = (
                 pool.submit(build(record, setup, keys.record, thetas, states).compile) if True in rounds else None
             )
-            improver = pool.submit(build(improve, setup, keys.update, states).compile) if False in rounds else None
-            updater = build(update, setup, keys.update, states, seen).compile() if True in rounds else None
+            given = setup, keys.update, states
+            improver = (
+                pool.submit(compile_once, _improve, *given, compiler_options=options) if False in rounds else None
+            )
+            updater = compile_once(_update, *given, seen, compiler_options=options) if True in rounds else None
 
         def advance(states: online.State) -> tuple[online.State, online.RoundInfo]:
             thetas = jax.numpy.asarray(self.hidden.at(int(states.round[0]) + 1))
@@ -134,6 +134,18 @@ class Plan:
         system: Any = self.setup.system
         effects = [type(w.effect) for w in getattr(getattr(system, "simulator", None), "effects", ())]
         return used_sources([online.init, online.run, online.Truncated, self.setup, *effects])
+
+
+def _update(setup: online.Setup, keys: Any, states: online.State, recordings: Any) -> Any:
+    """`online.update` of all seeds."""
+    one = lambda k, state, seen: online.update(k, setup, state, seen)  # noqa: E731
+    return _over_seeds(one, keys.shape[0])(keys, states, recordings)
+
+
+def _improve(setup: online.Setup, keys: Any, states: online.State) -> Any:
+    """`online.improve` of all seeds."""
+    one = lambda k, state: online.improve(k, setup, state)  # noqa: E731
+    return _over_seeds(one, keys.shape[0])(keys, states)
 
 
 def make_plan(settings: Settings) -> Plan:
