@@ -11,10 +11,10 @@ them are those of the package's own containers, and a file that cannot be read i
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
-import importlib
 import importlib.metadata
 import inspect
 import json
@@ -37,6 +37,9 @@ __all__ = ["Unnamed", "compile_once", "keep_traces_in", "name_of", "trace_once"]
 
 PACKAGE = __package__ or "bayessim_jax"
 STANDS_ON = ("jax", "jaxlib", "flax", "optax", "distrax", "mujoco", "numpy")
+OPTIONAL = ("brax", "mujoco-mjx")
+"""Engines that programs may be traced through without a word of them in a name."""
+CONTAINERS = {f"builtins.{kind.__name__}": kind for kind in (tuple, list, dict, type(None))}
 SETTINGS = (
     "enable_x64",
     "default_matmul_precision",
@@ -95,11 +98,13 @@ def trace_once(
         if any(isinstance(leaf, Tracer) for leaf in leaves):
             return traced(*args, **kwargs)
         key = _folder, tuple(fixed.values()), structure, tuple(map(_kind, leaves))
-        program = made.get(key)
-        if program is None:
-            program = made[key] = _find(_folder, function, fixed, leaves, structure, options) or traced
-        known = program is not traced
-        return give(program(*leaves) if known else program(*args, **kwargs), tied=known)
+        if key not in made:
+            applied = lambda given: function(**given, **fixed)  # noqa: E731
+            made[key] = _find(_folder, function, applied, fixed, leaves, structure, options)
+        if made[key] is None:
+            return give(traced(*args, **kwargs), tied=False)
+        program, returned = made[key]
+        return give(jax.tree.unflatten(returned, program(*leaves)), tied=True)
 
     return call
 
@@ -122,52 +127,27 @@ def compile_once(
     """
     options: Any = dict(compiler_options) if compiler_options else None
     leaves, structure = jax.tree.flatten(args)
-    kept = _keep(_folder, function, function, (), leaves, structure) if _folder is not None else None
-    if kept is None:
+    applied = lambda given: function(*given)  # noqa: E731
+    found = _find(_folder, function, applied, (), leaves, structure, options) if _folder is not None else None
+    if found is None:
         return jax.jit(function, compiler_options=options).lower(*args).compile()
-    exported, returned = kept
-    program = jax.jit(_naming(exported.call, function), compiler_options=options).lower(*leaves).compile()
+    program, returned = found[0].lower(*leaves).compile(), found[1]
     return lambda *args: jax.tree.unflatten(returned, program(*jax.tree.leaves(args)))
 
 
 def _find(
     folder: Path,
     function: Callable[..., Any],
-    fixed: dict[str, Any],
-    leaves: Sequence[Any],
-    structure: Any,
-    options: Any,
-) -> Callable[..., Any] | None:
-    """The program from the disk, or traced and put there; None where it has no name or cannot be kept."""
-    kept = _keep(folder, function, lambda **given: function(**given, **fixed), fixed, leaves, structure)
-    if kept is None:
-        return None
-    exported, returned = kept
-    program = jax.jit(_naming(exported.call, function), compiler_options=options)
-    return lambda *leaves: jax.tree.unflatten(returned, program(*leaves))
-
-
-def _naming(call: Callable[..., Any], function: Callable[..., Any]) -> Callable[..., Any]:
-    """A call that is named as a function is."""
-
-    def run(*leaves: Any) -> Any:
-        return call(*leaves)
-
-    run.__name__ = function.__name__
-    return run
-
-
-def _keep(
-    folder: Path,
-    function: Callable[..., Any],
-    applied: Callable[..., Any],
+    applied: Callable[[Any], Any],
     fixed: Any,
     leaves: Sequence[Any],
     structure: Any,
+    options: Any,
 ) -> tuple[Any, Any] | None:
-    """A function of leaves as it was exported, and the structure of what it returns, from the disk or put there.
+    """The program of leaves and the structure of what it returns, from the disk, or traced and put there.
 
-    `applied` is the function of what `structure` makes of the leaves, a dictionary or a tuple.
+    `applied` is the function of its arguments as `structure` holds them, given what is `fixed`. None where it has no
+    name or cannot be kept.
     """
     kinds = tuple((np.shape(x), _dtype(x), _is_weak(x)) for x in leaves)
     backend, settings = jax.default_backend(), [getattr(jax.config, f"jax_{name}") for name in SETTINGS]
@@ -180,8 +160,7 @@ def _keep(
         found: list[Any] = []
 
         def flat(*leaves: Any) -> Any:
-            given = jax.tree.unflatten(structure, leaves)
-            returned = applied(**given) if isinstance(given, dict) else applied(*given)
+            returned = applied(jax.tree.unflatten(structure, leaves))
             found[:] = [jax.tree.structure(returned)]
             return jax.tree.leaves(returned)
 
@@ -193,7 +172,13 @@ def _keep(
             return None  # a call into Python, which no file can hold, or a container of others
         _write(path, content)
         kept = exported, found[0]
-    return kept
+    exported, returned = kept
+
+    def run(*leaves: Any) -> Any:
+        return exported.call(*leaves)
+
+    run.__name__ = function.__name__
+    return jax.jit(run, compiler_options=options), returned
 
 
 def _describe(structure: Any, given: Any) -> Any:
@@ -245,14 +230,13 @@ def _from_json(data: Any) -> Any:
 
 
 def _container(name: str) -> type:
-    """A class of the package, or of Python's own containers."""
-    plain = {f"builtins.{kind.__name__}": kind for kind in (tuple, list, dict, type(None))}
-    if name in plain:
-        return plain[name]
+    """A class of the package, or one of Python's own containers."""
+    if name in CONTAINERS:
+        return CONTAINERS[name]
     module, _, last = name.rpartition(".")
     if module.partition(".")[0] != PACKAGE or module not in sys.modules:
         raise ValueError(f"{name} is no container of this package")
-    return getattr(importlib.import_module(module), last)
+    return getattr(sys.modules[module], last)
 
 
 def _untie(x: Any) -> Any:
@@ -301,6 +285,9 @@ def _standing() -> bytes:
     found = hashlib.sha256(sys.version.encode())
     for name in STANDS_ON:
         found.update(importlib.metadata.version(name).encode())
+    for name in OPTIONAL:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found.update(f"{name} {importlib.metadata.version(name)}".encode())
     root = Path(__file__).parent
     for path in sorted(root.rglob("*.py")):
         found.update(str(path.relative_to(root)).encode() + path.read_bytes())
