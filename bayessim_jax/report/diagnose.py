@@ -44,7 +44,7 @@ def headline(diagnosis: CaseDiagnosis) -> str:
     if result.verdict == "unexplained":
         sentence = f"Something is missing at {where or 'no single joint'}, and none of the candidates explains it."
         if result.entries:
-            best, floor = result.taken_back or result.entries[0], number(100 * diagnosis.noise_floor)
+            best, floor = result.best, number(100 * diagnosis.noise_floor)
             left = number(100 * share_left(best.misfit, result.baseline.misfit))
             sentence += f" The closest, {best.title}, leaves {left} % of the misfit"
             if not result.taken_back:

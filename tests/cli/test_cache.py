@@ -8,24 +8,15 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from bayessim_jax.cli.cache import use_compilation_cache
-from bayessim_jax.programs import keep_traces_in
-
-SETTINGS = (
-    "jax_compilation_cache_dir",
-    "jax_persistent_cache_min_compile_time_secs",
-    "jax_persistent_cache_min_entry_size_bytes",
-)
+from tests.cli.test_online_command import own_settings as own_settings
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    before = {name: getattr(jax.config, name) for name in SETTINGS}
+def folder(own_settings, tmp_path, monkeypatch):
+    """A cache of one's own, and JAX's settings put back after it."""
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
     compilation_cache.reset_cache()
     yield tmp_path
-    for name, value in before.items():
-        jax.config.update(name, value)
-    keep_traces_in(None)
     compilation_cache.reset_cache()
 
 

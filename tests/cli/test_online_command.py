@@ -22,6 +22,7 @@ from bayessim_jax.cli.parsing import UsageError
 from bayessim_jax.cli.plan import make_plan
 from bayessim_jax.cli.resolution import read_command
 from bayessim_jax.effects.vehicle import TERRAINS
+from bayessim_jax.programs import keep_traces_in
 
 TINY = """
 system = "cartpole"
@@ -60,6 +61,7 @@ def own_settings(monkeypatch):
     yield
     for name, value in before.items():
         jax.config.update(name, value)
+    keep_traces_in(None)
 
 
 def refused(capsys, *words):
