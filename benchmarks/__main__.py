@@ -80,6 +80,9 @@ def main() -> None:
     )
     thresholds.add_argument("--cases", type=int, default=60)
     thresholds.add_argument("--out", type=Path, help="file of JSON lines to append cases to, and to resume from")
+    thresholds.add_argument(
+        "--records", type=Path, nargs="+", help="of `concealed`: hold the answers in them against this"
+    )
 
     mppi = commands.add_parser("mppi", help="a control step of DISCO on the pendulum against pytorch_mppi")
     mppi.add_argument("--repeats", type=int, default=7)
@@ -101,6 +104,11 @@ def main() -> None:
 
         identify_clean(options)
         return
+    if options.command == "thresholds":
+        from benchmarks.thresholds import leave_families_out
+
+        leave_families_out(options)
+        return
     choose_clock(options.clock)
     if options.command == "online":
         from benchmarks.online import compare_rounds
@@ -110,10 +118,6 @@ def main() -> None:
         from benchmarks.estimator import compare_estimators
 
         compare_estimators(options)
-    elif options.command == "thresholds":
-        from benchmarks.thresholds import leave_families_out
-
-        leave_families_out(options)
     elif options.command == "mppi":
         from benchmarks.mppi import compare_planners
 

@@ -55,3 +55,10 @@ def test_an_unknown_benchmark_is_refused_in_one_line():
 def test_the_scoreboards_of_the_docs_are_printed_from_the_records(record):
     rows = [json.loads(line) for line in record.read_text().splitlines()]
     assert summarize([row | judge(row["sealed"], row) for row in rows]) in (ROOT / "docs/benchmarks.md").read_text()
+
+
+def test_what_the_docs_say_of_recorded_answers_is_printed_from_the_records():
+    records = sorted(map(str, (ROOT / "benchmarks/results").glob("concealed_[45]*.jsonl")))
+    command = [sys.executable, "-m", "benchmarks", "thresholds", "--records", *records]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    assert printed.strip() in (ROOT / "docs/diagnosis.md").read_text()
