@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Int, PRNGKeyArray
 
 from bayessim_jax.contracts import Belief, Box, GoalTask, Scalar, System, Task
@@ -158,9 +157,8 @@ class Her:
             "policy": self.network.init(policy_key, jnp.zeros(obs)),
             "critics": [self.critic.init(k, jnp.zeros(obs + act)) for k in keys],
         }
-        flat = ravel_pytree(weights)[0]
         replay = Replay.create(self.capacity, 2 * obs + act + 1)
-        return HerState(weights, flat, _ADAM.init(flat), Moments.create(obs), replay)
+        return HerState(weights, weights, _ADAM.init(weights), Moments.create(obs), replay)
 
     def policy(self, state: HerState, deterministic: bool = False) -> NetworkPolicy:
         """The current policy: with its noise to explore, deterministic to be judged."""
@@ -252,15 +250,16 @@ class Her:
 
     def _improve(self, key: PRNGKeyArray, state: HerState) -> tuple[HerState, Any]:
         """`updates` gradient steps of both losses at once; each loss moves its own weights only."""
-        flat, unravel = ravel_pytree(state.weights)
         replay_key, noise_key = jax.random.split(key)
         batches = self._replay(replay_key, state)
         noises = normal(draw(noise_key, (self.updates, self.batch, self.head.box.size)))
 
         values = partial(evaluate_critics, self.critic)
 
-        def loss(flat: Any, slow: Any, noise: Any, seen: Any, action: Any, after: Any, reward: Any, sound: Any) -> Any:
-            weights, frozen, slow = unravel(flat), unravel(jax.lax.stop_gradient(flat)), unravel(slow)
+        def loss(
+            weights: Any, slow: Any, noise: Any, seen: Any, action: Any, after: Any, reward: Any, sound: Any
+        ) -> Any:
+            frozen = jax.lax.stop_gradient(weights)
             mean = lambda x: jnp.sum(sound * x) / jnp.maximum(jnp.sum(sound), 1.0)  # noqa: E731
             shake = jnp.clip(self.smoothing * noise, -2.5 * self.smoothing, 2.5 * self.smoothing)
             next_action = jnp.clip(self._act(slow["policy"], after) + shake, -1.0, 1.0)
@@ -275,15 +274,15 @@ class Her:
             return value_loss + policy_loss, value_loss
 
         def update(carry: Any, x: Any) -> Any:
-            flat, slow, moments = carry
-            gradient, value_loss = jax.grad(loss, has_aux=True)(flat, slow, *x)
-            direction: Any
+            weights, slow, moments = carry
+            gradient, value_loss = jax.grad(loss, has_aux=True)(weights, slow, *x)
             direction, after = _ADAM.update(gradient, moments)
-            moved = flat - self.learning_rate * direction
-            taken = jnp.isfinite(jnp.sum(gradient**2))
-            stepped = moved, slow + self.slowness * (moved - slow), after
+            moved = jax.tree.map(lambda w, d: w - self.learning_rate * d, weights, direction)
+            followed = jax.tree.map(lambda s, w: s + self.slowness * (w - s), slow, moved)
+            taken, stepped = jnp.isfinite(optax.tree.norm(gradient)), (moved, followed, after)
             carry = jax.tree.map(lambda a, b: jnp.where(taken, a, b), stepped, carry)
             return carry, (jnp.where(taken, value_loss, 0.0), ~taken)
 
-        (flat, slow, moments), info = jax.lax.scan(update, (flat, state.slow, state.moments), (noises, *batches))
-        return replace(state, weights=unravel(flat), slow=slow, moments=moments), info
+        carry = (state.weights, state.slow, state.moments)
+        (weights, slow, moments), info = jax.lax.scan(update, carry, (noises, *batches))
+        return replace(state, weights=weights, slow=slow, moments=moments), info
