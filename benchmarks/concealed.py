@@ -217,8 +217,9 @@ def diagnose_concealed(options: Namespace) -> None:
         return {
             "verdict": table["verdict"],
             "p_value": table["misfit"]["p_value"],
-            "left": diagnosis.shares_left[:3],
-            "ahead": [entry.ahead for entry in diagnosis.result.entries[:3]],
+            "finalists": [entry.names for entry in diagnosis.result.entries],
+            "left": diagnosis.shares_left,
+            "ahead": [entry.ahead for entry in diagnosis.result.entries],
             "closest": diagnosis.result.entries[0].names if diagnosis.result.entries else [],
             "nrmse": {k: v["nrmse"] for k, v in table["fit"].items() if isinstance(v, dict)},
             "noise_floor": table["fit"]["noise_floor"],

@@ -111,8 +111,8 @@ def summarize(rows: Sequence[dict[str, Any]]) -> str:
 def hold_against_held_out(records: Sequence[Path]) -> str:
     """How many recorded answers, of what kind, `falls_short` takes back, and the least that single effects leave ahead.
 
-    The latter are those that came closest to an effect of no library; with a memory they are excused where their past
-    is unknown.
+    The latter are finalists for an effect of no library, of older records the one that came closest; with a memory they
+    are excused where their past is unknown.
     """
     rows = [json.loads(line) for path in records for line in path.read_text(encoding="utf-8").splitlines()]
     found, back = Counter[str](), Counter[str]()
@@ -128,16 +128,17 @@ def hold_against_held_out(records: Sequence[Path]) -> str:
             if falls_short(nrmse["baseline"], nrmse["augmented"], floor, Thresholds()):
                 back.update(kinds)
     for row in unknown:
-        if len(row["closest"]) == 1 and "ahead" in row and row["ahead"][0] == row["ahead"][0]:
-            name = row["closest"][0]
-            recalls = bool(getattr(EFFECTS[name.partition("@")[0]], "recalls", False))
-            nearest[recalls].append((row["ahead"][0], f"{name} for {row['case']['effects'][0]}"))
+        finalists = row.get("finalists", [row["closest"]])
+        for names, ahead in zip(finalists, row.get("ahead", ()), strict=False):
+            if len(names) == 1 and np.isfinite(ahead):
+                recalls = bool(getattr(EFFECTS[names[0].partition("@")[0]], "recalls", False))
+                nearest[recalls].append((ahead, f"{names[0]} for {row['case']['effects'][0]}"))
     lines = [f"{kind}: {back[kind]} of {count} taken back" for kind, count in found.items()]
     for recalls, each in nearest.items():
         if each:
             share, name = min(each)
             kind = "with a memory" if recalls else "without one"
             lines.append(
-                f"single effects {kind} that came closest, {len(each)}: {share:.1%} of the error ahead, {name}"
+                f"single effects {kind} among the finalists, {len(each)}: {share:.1%} of the error ahead, {name}"
             )
     return "\n".join(lines)
