@@ -75,7 +75,7 @@ LEAST = {
     "noise": 0.0,
     "forget": 0.0,
 }
-FETCH = {"noise": 0.001, "warmup": 3, "evaluations": 10, "history": 8, "calibrations": 64}
+FETCH = {"noise": 0.001, "warmup": 3, "evaluations": 10, "history": 16, "calibrations": 64}
 DIAGNOSED = "diagnosed"
 """The system of a run that has its simulator from a diagnosis."""
 HABITS: dict[str, dict[str, Any]] = {

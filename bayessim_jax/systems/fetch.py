@@ -18,7 +18,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from bayessim_jax.contracts import Box, Discrete, Scalar
+from bayessim_jax.contracts import Box, Discrete, Recording, Scalar
 from bayessim_jax.engines.fields import Write
 from bayessim_jax.engines.gymnasium import find_fetch_friction, require_robotics
 from bayessim_jax.engines.mujoco import MujocoEngine, MujocoState
@@ -168,6 +168,41 @@ class Fetch:
             state.goal,
         )
         return jnp.concatenate(shown)
+
+    @staticmethod
+    def features(recording: Recording) -> Float[Array, "steps features"]:
+        """What networks read of a transition, in axes that point from the gripper to the object, aside, and up.
+
+        Where on the table things happen says nothing of θ, nor does the goal. Rates before and after, their change, the
+        ways of object and gripper and their difference are shown as asinh(x / s) with s some times the sensors' noise:
+        an object that comes to rest within millimetres tells of friction, and one that is flung away hides it.
+        """
+        before, after = recording.observations[:-1], recording.observations[1:]
+        apart = before[:, 6:8]
+        distance = jnp.sqrt(jnp.sum(apart**2, -1, keepdims=True) + 1e-6)
+        cos, sin = jnp.moveaxis(apart / distance, -1, 0)
+
+        def turned(v: Array) -> Array:
+            return jnp.stack([cos * v[:, 0] + sin * v[:, 1], cos * v[:, 1] - sin * v[:, 0], v[:, 2]], -1)
+
+        grip, later_grip = before[:, 20:23], after[:, 20:23]
+        thing, later_thing = before[:, 14:17] + grip, after[:, 14:17] + later_grip
+        way, grip_way = after[:, 3:6] - before[:, 3:6], after[:, :3] - before[:, :3]
+        ways = (thing, later_thing, later_thing - thing, way, grip, later_grip, grip_way, way - grip_way)
+        angle = after[:, 11:14] - before[:, 11:14]
+        turns = (before[:, 17:20], after[:, 17:20], jnp.arctan2(jnp.sin(angle), jnp.cos(angle)))
+        side = before[:, 13] - jnp.arctan2(sin, cos)
+        tilt = jnp.sin(before[:, 11:13])
+        columns = (
+            distance,
+            before[:, 8:9],
+            turned(recording.actions[:, :3]),
+            *(jnp.arcsinh(turned(v) / 0.004) for v in ways),
+            *(jnp.arcsinh(turned(v) / 0.02) for v in turns),
+            jnp.stack([jnp.cos(4.0 * side), jnp.sin(4.0 * side)], -1),
+            turned(jnp.concatenate([tilt, before[:, 5:6] - before[:1, 5:6]], -1)),
+        )
+        return jnp.where(recording.valid[:, None], jnp.concatenate(columns, -1), 0.0)
 
 
 @struct.dataclass

@@ -151,3 +151,40 @@ def test_without_gymnasium_robotics_one_line_tells(monkeypatch):
     monkeypatch.setattr(host.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"pip install 'bayessim-jax\[fetch\]'"):
         host.gymnasium_target("fetch_push", [0.5])
+
+
+def test_features_do_not_know_where_on_the_table_things_happen():
+    """Turning and moving the whole scene changes what is seen, and nothing of what an encoder reads."""
+    system, steps = system_of("fetch_push"), 6
+    rng = np.random.default_rng(0)
+    o = 0.01 * rng.normal(size=(steps + 1, system.observations.size))
+    o[:, :3] += (1.3, 0.7, 0.45)
+    o[:, 3:6] = o[:, :3] + (0.1, 0.05, -0.02) + 0.01 * rng.normal(size=(steps + 1, 3))
+    o[:, 6:9] = o[:, 3:6] - o[:, :3]
+    o[:, 11:13] = 0.0  # the angles of a tilted object are no vector
+    u, (cos, sin) = rng.normal(size=(steps, 4)), (np.cos(0.7), np.sin(0.7))
+
+    def turned(v):
+        return np.stack([cos * v[:, 0] - sin * v[:, 1], sin * v[:, 0] + cos * v[:, 1], v[:, 2]], -1)
+
+    there, v = o.copy(), u.copy()
+    for first in (0, 3, 6, 14, 17, 20, 25):
+        there[:, first : first + 3] = turned(o[:, first : first + 3])
+    for first in (0, 3, 25):
+        there[:, first : first + 2] += (0.2, -0.1)
+    there[:, 13] += 0.7
+    v[:, :3] = turned(u[:, :3])
+    valid = np.arange(steps) < 4
+    bare = jax.eval_shape(
+        lambda: rollout(jax.random.key(0), system, jnp.array([0.5]), RandomPolicy(system.actions), steps)
+    )
+    empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), bare)
+
+    def read(observations, actions):
+        as_arrays = {"observations": jnp.asarray(observations), "actions": jnp.asarray(actions)}
+        return np.asarray(system.features(empty.replace(valid=jnp.asarray(valid), **as_arrays)))
+
+    np.testing.assert_allclose(read(there, v), read(o, u), atol=2e-3)
+    assert (read(o, u)[valid].std(0) > 1e-3).sum() > 30
+    assert (read(o, u)[~valid] == 0).all()
+    assert not np.allclose(read(there, u), read(o, u), atol=0.1)
