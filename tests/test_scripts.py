@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from bayessim_jax.cli.main import main
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -35,6 +37,22 @@ def test_figure_two_runs_and_draws(tmp_path):
     assert [line["scheme"] for line in lines] == ["online", "offline", "uniform"]
     assert all(len(line["success"]) == 2 for line in lines)
     assert figure.stat().st_size > 1000
+
+
+@pytest.mark.slow
+def test_a_run_tells_how_well_its_recordings_are_read(tmp_path):
+    """The run is left as it was; a system with no features of its own is read alike both ways."""
+    folder = tmp_path / "run"
+    words = ["online", "pendulum", "--target", "simulated", "--rounds", "1", "--simulations", "10", "--history", "1"]
+    assert main([*words, "--calibrations", "10", "--steps", "20", "--quiet", "--out", str(folder)]) == 0
+    before = sorted(path.relative_to(folder) for path in folder.rglob("*"))
+    said = run("read_recordings.py", folder, "--simulations", 20, 60, "--held-out", 100).splitlines()
+    assert sorted(path.relative_to(folder) for path in folder.rglob("*")) == before
+    assert said[0].startswith("prior: ")
+    assert [line.split(":")[0] for line in said[1:]] == [
+        f"{name}, {n} simulations" for name in ("plain", "of the system") for n in (20, 60)
+    ]
+    assert said[1].split("log q")[1] == said[3].split("log q")[1]
 
 
 @pytest.mark.slow
