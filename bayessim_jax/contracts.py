@@ -11,7 +11,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 __all__ = [
     "Belief",
@@ -221,8 +221,12 @@ class Estimator(Protocol[E]):
         thetas: Float[Array, "n d"],
         recordings: Recording,
         weights: Float[Array, " n"],
+        draws: Int[Array, " n"] | None = None,
     ) -> tuple[E, Any]:
-        """Continue from `state` and maximize Σ wᵢ log q(θᵢ | recordingᵢ); a weight of zero switches a draw off."""
+        """Continue from `state` and maximize Σ wᵢ log q(θᵢ | recordingᵢ); a weight of zero switches a pair off.
+
+        `draws` numbers the draw of θ that a pair is of, where several pairs share one; else each has its own.
+        """
         ...
 
     def calibrate(

@@ -85,6 +85,8 @@ class Setup:
     calibrations: int = struct.field(pytree_node=False, default=FEWEST)
     """Draws of θ for which as many recordings are simulated as the target has given: what the posterior of several
     recordings is learned from, and calibrated."""
+    kept: int = struct.field(pytree_node=False, default=0)
+    """Of these sets, how many at most join the pool: their recordings are fitted from the next round on."""
     components: int = struct.field(pytree_node=False, default=5)
     """Gaussians in the belief."""
     replay: bool = struct.field(pytree_node=False, default=False)
@@ -119,10 +121,11 @@ class Setup:
         recordings are remembered, more of their sets are to be had at the same cost.
         """
         for name, value in sizes.items():
-            if value < (0 if name in ("evaluations", "warmup", "inferences", "calibrations") else 1):
+            if value < (0 if name in ("evaluations", "warmup", "inferences", "calibrations", "kept") else 1):
                 raise ValueError(f"Setup: {name} is {value}; it must be a positive number.")
         if not sizes.get("calibrations"):
             sizes["calibrations"] = min(max(SETS // sizes.get("history", cls.history), FEWEST), MOST)
+        sizes["kept"] = min(sizes.get("kept", 0), sizes["calibrations"])
         if not 0 <= forget < 1:
             raise ValueError(f"Setup: forget is {forget}; it is a probability, from 0 to below 1.")
         if sizes.get("history", cls.history) % sizes.get("recordings", cls.recordings):
@@ -141,12 +144,13 @@ class Setup:
 
 @struct.dataclass
 class Pool:
-    """Simulations of the last rounds: axes are (round slot, draw of θ, 1, …)."""
+    """Simulations of the last rounds: axes are (round slot, draw of θ, recording, …)."""
 
     thetas: Float[Array, "rounds n d"]
     recordings: Recording
     proposals: Any
-    filled: Float[Array, " rounds"]
+    filled: Bool[Array, "rounds recording"]
+    """Which recordings of every draw are there to be fitted."""
 
 
 @struct.dataclass
@@ -158,6 +162,9 @@ class State:
     estimator: Any
     learner: Any
     pool: Pool
+    """One recording of every draw."""
+    sets: Pool
+    """`setup.kept` draws with as many recordings as are remembered, simulated for the calibration."""
     history: Recording
     """What the target has shown, leading axis `setup.history`; the slots not yet filled are empty recordings."""
     policies: Any
@@ -224,17 +231,21 @@ def init(key: PRNGKeyArray, setup: Setup) -> State:
     def empty(*axes: int) -> Recording:
         return jax.tree.map(lambda leaf: jnp.zeros((*axes, *leaf.shape[1:]), leaf.dtype), one)
 
+    def blank(draws: int, size: int) -> Pool:
+        return Pool(
+            thetas=jnp.broadcast_to(belief.box.low, (slots, draws, d)),
+            recordings=empty(slots, draws, size),
+            proposals=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (slots, *jnp.shape(leaf))), proposal),
+            filled=jnp.zeros((slots, size), bool),
+        )
+
     return State(
         round=jnp.array(0),
         belief=belief,
         estimator=setup.estimator.init(estimator_key, empty(remembered), d),
         learner=learner,
-        pool=Pool(
-            thetas=jnp.broadcast_to(belief.box.low, (slots, setup.simulations, d)),
-            recordings=empty(slots, setup.simulations, 1),
-            proposals=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (slots, *jnp.shape(leaf))), proposal),
-            filled=jnp.zeros(slots),
-        ),
+        pool=blank(setup.simulations, 1),
+        sets=blank(setup.kept if setup.proposal.reuse else 0, remembered),
         history=empty(remembered),
         policies=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (remembered, *jnp.shape(leaf))), policy),
     )
@@ -311,10 +322,13 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
     earlier = jax.random.categorical(slot_key, jnp.where(use, 0.0, -jnp.inf), shape=(fresh,))
     slots = jnp.where(jnp.arange(fresh) % 2 == 0, newest, jnp.where(use.any(), earlier, newest))
     simulated = simulate(simulate_key, setup, policies, thetas[:fresh], slots)
-    pool = _insert(state.pool, done, thetas[:fresh], jax.tree.map(lambda x: x[:, None], simulated), proposal)
-    weights = pool_weights(pool.thetas, pool.proposals, pool.filled, proposal).ravel()
-    points, singles = jax.tree.map(_rows, (pool.thetas, pool.recordings))
-    estimator, fit = setup.estimator.fit(fit_key, state.estimator, points, singles, weights)
+    singles = jax.tree.map(lambda x: x[:, None], simulated)
+    pool = _insert(state.pool, done, thetas[:fresh], singles, proposal, jnp.ones(1, bool))
+    pairs: Any = _pairs(pool, proposal)
+    if state.sets.thetas.size:
+        pairs = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), pairs, _pairs(state.sets, proposal))
+    weights = pairs[2]
+    estimator, fit = setup.estimator.fit(fit_key, state.estimator, *pairs)
 
     if setup.forget:
         use = use & _agree(setup, estimator, history, newest)
@@ -332,6 +346,8 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
         state.belief.box,
         correct=setup.proposal.accumulate,
     )
+    served = jax.tree.map(lambda leaf: leaf[: state.sets.thetas.shape[1]], sets)
+    kept = _insert(state.sets, done, thetas[fresh:][: state.sets.thetas.shape[1]], served, proposal, use)
     q = setup.estimator.posterior(estimator, history, use)
     posterior = setup.proposal.combine(state.belief, proposal, q)
     growth, gap = posterior.against(state.belief)
@@ -355,7 +371,7 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
         uninformed=uninformed,
         collapsed=calibration.collapsed & ~stays,
     )
-    after = State(state.round + 1, belief, estimator, learner, pool, history, policies)
+    after = State(state.round + 1, belief, estimator, learner, pool, kept, history, policies)
     return jax.lax.optimization_barrier((after, info))
 
 
@@ -402,11 +418,22 @@ def run(
     return jax.lax.scan(one_round, init(keys.init, setup) if state is None else state, None, length=rounds)
 
 
-def _insert(pool: Pool, done: Array, thetas: Array, recordings: Recording, proposal: Any) -> Pool:
+def _insert(pool: Pool, done: Array, thetas: Array, recordings: Recording, proposal: Any, there: Array) -> Pool:
     """Overwrite the oldest slot."""
     slot = done % pool.filled.shape[0]
-    return jax.tree.map(
-        lambda leaf, new: leaf.at[slot].set(new), pool, Pool(thetas, recordings, proposal, jnp.ones(()))
+    return jax.tree.map(lambda leaf, new: leaf.at[slot].set(new), pool, Pool(thetas, recordings, proposal, there))
+
+
+def _pairs(pool: Pool, proposal: Any) -> tuple[Array, Recording, Array, Array]:
+    """Every θ with each of its recordings alone: θ, recordings, weights under the proposal, and which draw of θ."""
+    slots, n, d = pool.thetas.shape
+    size = pool.filled.shape[1]
+    weights = pool_weights(pool.thetas, pool.proposals, pool.filled.any(-1), proposal)
+    return (
+        jnp.broadcast_to(pool.thetas[:, :, None], (slots, n, size, d)).reshape(-1, d),
+        jax.tree.map(lambda leaf: leaf.reshape(-1, 1, *leaf.shape[3:]), pool.recordings),
+        (weights[:, :, None] * pool.filled[:, None]).ravel(),
+        jnp.repeat(jnp.arange(slots * n), size),
     )
 
 
@@ -434,8 +461,3 @@ def _agree(setup: Setup, estimator: Any, history: Recording, newest: Array) -> B
     gaps, widths = means - means[newest], covariances + covariances[newest]
     distance = jax.vmap(lambda gap, width: gap @ jnp.linalg.solve(width, gap))(gaps, widths)
     return jax.scipy.stats.chi2.sf(distance, means.shape[-1]) > 1e-3
-
-
-def _rows(leaf: Array) -> Array:
-    """Join the first two axes, also where another one is empty (a machine without actuators)."""
-    return leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:])

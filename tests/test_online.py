@@ -1,7 +1,10 @@
 """The outer loop: the same run however it is cut, and nothing silent."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from flax import struct
 
@@ -43,6 +46,7 @@ def cartpole():
         components=2,
         history=4,
         calibrations=16,
+        kept=5,
     )
     return setup, SimulatedTarget(system, task, jnp.array([0.4, 0.6]))
 
@@ -60,6 +64,34 @@ def test_the_shorter_the_memory_the_more_sets_it_is_judged_by(history, sets):
     assert make(calibrations=7).calibrations == 7
     with pytest.raises(ValueError, match="calibrations is -1"):
         make(calibrations=-1)
+
+
+def test_kept_sets_are_fitted_from_the_next_round_on_where_they_tell_of_recordings_in_use(cartpole, run):
+    given = []
+
+    @struct.dataclass
+    class Spy(MixtureDensity):
+        """Notes what it is fitted to."""
+
+        def fit(self, key, state, thetas, recordings, weights, draws=None):
+            jax.debug.callback(lambda *seen: given.append(seen), thetas, recordings.observations, weights, draws)
+            return super().fit(key, state, thetas, recordings, weights, draws)
+
+    setup, target = cartpole
+    spy = Spy(**{field.name: getattr(TINY, field.name) for field in dataclasses.fields(TINY)})
+    state, _ = run(jax.random.key(3), setup.replace(estimator=spy), target, rounds=3)
+    jax.effects_barrier()
+    assert len(given) == 3
+    for (thetas, seen, weights, draws), counts in zip(given, ((0, 0), (1, 0), (1, 2)), strict=True):
+        assert len(thetas) == len(seen) == len(weights) == len(draws) == 2 * 32 + 2 * 5 * 4
+        assert ((weights[64:] > 0).reshape(2, 5, 4).sum(-1) == np.array(counts)[:, None]).all()
+        assert (draws[64:] == np.repeat(np.arange(10), 4)).all() and (draws[:64] == np.arange(64)).all()
+    *_, (thetas, seen, _, _) = given
+    kept = thetas[64:].reshape(2, 5, 4, -1)
+    assert (kept == kept[:, :, :1]).all() and np.ptp(kept[:, :, 0], 1).min() > 0
+    of_two = seen[64:].reshape(2, 5, 4, *seen.shape[-2:])[1, :, :2]
+    assert not np.allclose(of_two[:, 0], of_two[:, 1])
+    assert state.sets.filled.tolist() == [[True] * 3 + [False], [True] * 2 + [False] * 2]
 
 
 def test_one_recording_beside_a_readout_of_sets_is_what_the_networks_say(cartpole):
@@ -122,6 +154,7 @@ def test_cuts_change_nothing_where_only_some_rounds_infer(cartpole, run, warmup,
     assert _same(last, start.belief) == (inferences == 0)
     assert jnp.isfinite(infos.return_target).all()
     assert whole.pool.filled.sum() == min(inferences, 2)
+    assert whole.sets.filled.sum() == (0, 1, 3)[inferences]
     _check_that_chunks_change_nothing(setup, target, run, key, start, whole, infos)
 
     state, record, update, improve = start, *map(compiled, (online.record, online.update, online.improve))

@@ -45,14 +45,19 @@ def test_a_run_tells_how_well_its_recordings_are_read(tmp_path):
     folder = tmp_path / "run"
     words = ["online", "pendulum", "--target", "simulated", "--rounds", "1", "--simulations", "10", "--history", "1"]
     assert main([*words, "--calibrations", "10", "--steps", "20", "--quiet", "--out", str(folder)]) == 0
-    before = sorted(path.relative_to(folder) for path in folder.rglob("*"))
-    said = run("read_recordings.py", folder, "--simulations", 20, 60, "--held-out", 100).splitlines()
+    before, two = sorted(path.relative_to(folder) for path in folder.rglob("*")), ("attention", "pooled_lstm")
+    said = run(
+        "read_recordings.py", folder, "--simulations", 20, 60, "--held-out", 100, "--encoders", *two
+    ).splitlines()
     assert sorted(path.relative_to(folder) for path in folder.rglob("*")) == before
     assert said[0].startswith("prior: ")
     assert [line.split(":")[0] for line in said[1:]] == [
-        f"{name}, {n} simulations" for name in ("plain", "of the system") for n in (20, 60)
+        f"{reading}, {name}, {n} simulations"
+        for reading in ("plain", "of the system")
+        for name in two
+        for n in (20, 60)
     ]
-    assert said[1].split("log q")[1] == said[3].split("log q")[1]
+    assert said[1].split("log q")[1] == said[5].split("log q")[1]
 
 
 @pytest.mark.slow

@@ -71,11 +71,20 @@ LEAST = {
     "seed": 0,
     "evaluations": 0,
     "calibrations": 0,
+    "kept": 0,
     "warmup": 0,
     "noise": 0.0,
     "forget": 0.0,
 }
-FETCH = {"noise": 0.001, "warmup": 3, "evaluations": 10, "history": 16, "calibrations": 64}
+FETCH = {
+    "noise": 0.001,
+    "encoder": "attention",
+    "warmup": 3,
+    "evaluations": 10,
+    "history": 16,
+    "calibrations": 64,
+    "kept": 64,
+}
 DIAGNOSED = "diagnosed"
 """The system of a run that has its simulator from a diagnosis."""
 HABITS: dict[str, dict[str, Any]] = {
@@ -127,9 +136,10 @@ class Settings:
     """Seed of everything random; with several seeds, the first of them."""
     seeds: int = 1
     """Runs at once, each with its own seed and truth, to show the spread."""
-    encoder: Literal["pooled_lstm", "lstm", "fourier", "summary"] = "pooled_lstm"
-    """How a recording is read: a fast LSTM over pooled frames, the paper's LSTM, or hand-made summaries with and
-    without random Fourier features (the BayesSim RFF and epsilon-free baselines)."""
+    encoder: Literal["pooled_lstm", "lstm", "attention", "fourier", "summary"] = "pooled_lstm"
+    """How a recording is read: a fast LSTM over pooled frames, the paper's LSTM, transitions averaged with weights that
+    are learned, or hand-made summaries with and without random Fourier features (the BayesSim RFF and epsilon-free
+    baselines)."""
     proposal: Literal["corrected", "paper", "truncated"] = "corrected"
     """Where to simulate in the next round: the paper's mode, with the proposal divided out, or the truncated prior."""
     simulations: int = 200
@@ -147,6 +157,8 @@ class Settings:
     calibrations: int = 0
     """Sets of recordings simulated in a round, to learn the posterior of a set from and to calibrate it; 0 for as many
     as make 32768 recordings, from 1024 to 4096."""
+    kept: int = 0
+    """Of these sets, how many at most join the simulations that the networks are fitted to from the next round on."""
     components: int = 5
     """Gaussians in the posterior."""
     noise: float = 0.01

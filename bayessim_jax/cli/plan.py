@@ -171,7 +171,7 @@ def _make_plan(settings: Settings) -> Plan:
     box = system.parameters
     pace = dataclasses.asdict(Schedule()) | _checked(dataclasses.asdict(Schedule()), settings.schedule, "schedule")
     learner, habits = _learner(controller, settings, system, task)
-    sizes = ("steps", "simulations", "recordings", "evaluations", "pool", "history", "calibrations", "components")
+    sizes = ("steps", "simulations", "recordings", "evaluations", "pool", "history", "calibrations", "kept")
     setup = online.Setup.create(
         system,
         learner,
@@ -182,6 +182,7 @@ def _make_plan(settings: Settings) -> Plan:
         forget=settings.forget,
         warmup=settings.warmup,
         inferences=INFERENCES[settings.scheme],
+        components=settings.components,
         **{name: getattr(settings, name) for name in sizes},
     )
     seeds = list(range(settings.seed, settings.seed + settings.seeds))

@@ -1,4 +1,4 @@
-"""Recurrent encoders: a recording becomes a fixed-length embedding, with no hand-made summaries.
+"""Encoders: a recording becomes a fixed-length embedding, with no hand-made summaries.
 
 Every encoder is a pair of pure functions over a batch of sequences. It reads the same features at each step: the
 observations, their finite differences, the action, and whether the step happened.
@@ -6,7 +6,7 @@ observations, their finite differences, the action, and whether the step happene
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import jax
@@ -19,6 +19,7 @@ from bayessim_jax.spelling import find_named
 
 __all__ = [
     "ENCODERS",
+    "Attention",
     "Encoder",
     "Features",
     "Lstm",
@@ -103,13 +104,10 @@ class Lstm:
     def init(self, key: PRNGKeyArray, features: int) -> dict[str, Any]:
         """Glorot weights, and a forget gate that starts open."""
         w_key, u_key, *keys = jax.random.split(key, 2 + len(self.widths))
-        inputs = (features, *self.widths)
         h = self.size
         return {
-            "read": [
-                {"w": glorot(k, a, b), "b": jnp.zeros(b)} for k, a, b in zip(keys, inputs, self.widths, strict=False)
-            ],
-            "w": glorot(w_key, inputs[-1], 4 * h),
+            "read": _layers(keys, features, self.widths),
+            "w": glorot(w_key, (features, *self.widths)[-1], 4 * h),
             "u": glorot(u_key, h, 4 * h),
             "b": jnp.zeros(4 * h).at[h : 2 * h].set(1.0),
         }
@@ -119,8 +117,7 @@ class Lstm:
     ) -> Float[Array, "batch size"]:
         """The mean of the hidden states after valid steps."""
         h = self.size
-        for layer in params["read"]:
-            x = jax.nn.gelu(x @ layer["w"] + layer["b"])
+        x = _read(params["read"], x)
         if self.frame > 1:
             x, valid = pool(x, valid, self.frame)
         # σ(a) = ½ + ½ tanh(a/2): with the halves folded into the weights all four gates are one tanh
@@ -186,6 +183,63 @@ _lstm.defvjp(_lstm_forward, _lstm_backward)
 
 
 @struct.dataclass
+class Attention:
+    """Means of what is read of each transition, with weights that are learned: nothing recurs.
+
+        rₜ = layers(xₜ),   aₜₖ = exp sₖ(rₜ) / Σⱼ exp sₖ(rⱼ),   h = (Σₜ aₜₖ vₖ(rₜ), log Σₜ exp sₖ(rₜ))ₖ
+
+    with scores s and values v linear in the readings r. Where what is observed is the whole state, each transition is
+    an estimate of θ of its own, and most say little: vₖ takes the part of the estimate, exp sₖ that of its precision,
+    and the last entry that of the precision of all together. Invalid steps have no weight.
+
+    Source: Ilse et al. 2018; Lee et al. 2019
+    """
+
+    widths: tuple[int, ...] = struct.field(pytree_node=False, default=(64, 64))
+    """Layers x ← gelu(W x + b) that read each step."""
+    heads: int = struct.field(pytree_node=False, default=8)
+    """Weightings of the steps, k."""
+    values: int = struct.field(pytree_node=False, default=4)
+    """Numbers that each weighting averages."""
+
+    def init(self, key: PRNGKeyArray, features: int) -> dict[str, Any]:
+        """Glorot weights; small ones for the scores, so that all steps count alike at first."""
+        score_key, value_key, *keys = jax.random.split(key, 2 + len(self.widths))
+        size = (self.widths or (features,))[-1]
+        return {
+            "read": _layers(keys, features, self.widths),
+            "score": {"w": 0.1 * glorot(score_key, size, self.heads), "b": jnp.zeros(self.heads)},
+            "value": _dense(value_key, size, self.heads * self.values),
+        }
+
+    def apply(
+        self, params: Any, x: Float[Array, "batch steps features"], valid: Bool[Array, "batch steps"]
+    ) -> Float[Array, "batch size"]:
+        """The weighted means, then the logarithms of the sums of weights."""
+        x = _read(params["read"], x)
+        scores = x @ params["score"]["w"] + params["score"]["b"]
+        scores = jnp.where(valid[..., None], scores, -30.0)
+        values = (x @ params["value"]["w"] + params["value"]["b"]).reshape(*scores.shape, self.values)
+        means = jnp.einsum("bsh,bshv->bhv", jax.nn.softmax(scores, axis=1), values)
+        return jnp.concatenate([means.reshape(x.shape[0], -1), jax.nn.logsumexp(scores, axis=1)], axis=-1)
+
+
+def _dense(key: PRNGKeyArray, rows: int, columns: int) -> dict[str, Array]:
+    return {"w": glorot(key, rows, columns), "b": jnp.zeros(columns)}
+
+
+def _layers(keys: Sequence[PRNGKeyArray], features: int, widths: tuple[int, ...]) -> list[dict[str, Array]]:
+    return [_dense(key, a, b) for key, a, b in zip(keys, (features, *widths), widths, strict=False)]
+
+
+def _read(layers: list[dict[str, Array]], x: Float[Array, "*n features"]) -> Float[Array, "*n size"]:
+    """Layers that all steps share."""
+    for layer in layers:
+        x = jax.nn.gelu(x @ layer["w"] + layer["b"])
+    return x
+
+
+@struct.dataclass
 class Windowed:
     """A set of windows that share θ, laid end to end in one sequence: the mean of their embeddings, and of their rows.
 
@@ -216,7 +270,11 @@ def _mean(x: Float[Array, "batch steps size"], valid: Bool[Array, "batch steps"]
     return jnp.where(valid[..., None], x, 0.0).sum(1) / jnp.maximum(valid.sum(1), 1)[:, None]
 
 
-ENCODERS: dict[str, Encoder] = {"pooled_lstm": Lstm(size=32, widths=(32, 32), frame=10), "lstm": Lstm()}
+ENCODERS: dict[str, Encoder] = {
+    "pooled_lstm": Lstm(size=32, widths=(32, 32), frame=10),
+    "lstm": Lstm(),
+    "attention": Attention(),
+}
 
 
 def lookup_encoder(name: str) -> Encoder:

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bayessim_jax.beliefs import GaussianMixture, moment_match
 from bayessim_jax.contracts import Box, Recording, Scalar
@@ -110,13 +110,14 @@ class MixtureDensity:
         thetas: Float[Array, "n d"],
         recordings: Recording,
         weights: Float[Array, " n"],
+        draws: Int[Array, " n"] | None = None,
     ) -> tuple[EstimatorState, FitInfo]:
         """Continue from `state`; scores in the Info are log densities in the units of θ, for one recording."""
         weights = jnp.where(recordings.diverged.any(-1), 0.0, weights)
         state = self._set_units(state, thetas, recordings, weights)
         z = (thetas - state.shift) / state.scale
         inputs = self._inputs(state, recordings)
-        fold = jnp.arange(z.shape[0]) % self.folds
+        fold = (jnp.arange(z.shape[0]) if draws is None else draws) % self.folds
         size = recordings.valid.shape[1]
         flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), inputs)
         each_z, each_weight, each_fold = (jnp.repeat(leaf, size, axis=0) for leaf in (z, weights, fold))

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from bayessim_jax.beliefs import GaussianMixture, Truncated, Uniform, quotient, reduce
 from bayessim_jax.contracts import Belief, Box
@@ -131,23 +131,23 @@ def _fitted(mixture: GaussianMixture, belief: Truncated, most: int = 32) -> Trun
 
 
 def pool_weights(
-    thetas: Float[Array, "rounds n d"], proposals: Any, filled: Float[Array, " rounds"], target: Belief
+    thetas: Float[Array, "rounds n d"], proposals: Any, filled: Bool[Array, " rounds"], target: Belief
 ) -> Float[Array, "rounds n"]:
     """Weights that make pooled draws of several proposals stand for draws of one, scaled to at most one.
 
         w = p̃(θ) / (1/R Σᵣ p̃ᵣ(θ))
 
     The denominator is the mixture of all proposals that filled the pool, so no weight exceeds R. `proposals` is the
-    stack of them, `filled[r]` is 1 where round r has been simulated.
+    stack of them, `filled[r]` says whether round r has been simulated.
 
     Source: Veach and Guibas 1995
     """
     points = thetas.reshape(-1, thetas.shape[-1])
     log_each = jax.vmap(lambda p: jax.vmap(p.log_prob)(points))(proposals)
-    log_filled = jnp.where(filled > 0, 0.0, -jnp.inf)
+    log_filled = jnp.where(filled, 0.0, -jnp.inf)
     log_mixture = jax.nn.logsumexp(log_each + log_filled[:, None], axis=0)
     log_weights = jax.vmap(target.log_prob)(points) - log_mixture
-    used = (filled > 0)[:, None] & jnp.isfinite(log_weights).reshape(thetas.shape[:2])
+    used = filled[:, None] & jnp.isfinite(log_weights).reshape(thetas.shape[:2])
     return jnp.where(used, jnp.exp(jnp.minimum(log_weights, 0.0)).reshape(thetas.shape[:2]), 0.0)
 
 

@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from bayessim_jax.inference.encoders import ENCODERS, Lstm, lookup_encoder, pool
+from bayessim_jax.inference.encoders import ENCODERS, Attention, Lstm, lookup_encoder, pool
 
 STEPS, FEATURES, BATCH = 12, 3, 5
 
@@ -70,6 +70,24 @@ def test_layers_that_read_each_step_come_before_the_recurrence():
     (layer,) = params["read"]
     read = jax.nn.gelu(x @ layer["w"] + layer["b"])
     assert jnp.allclose(deep.apply(params, x, valid), plain.apply(params | {"read": []}, read, valid), atol=1e-6)
+
+
+def test_attention_can_weigh_independent_estimates_by_their_precisions():
+    """The mean of a Gaussian given estimates of it that differ in precision, and the precision of the mean."""
+    estimates = jax.random.normal(jax.random.key(0), (BATCH, 9))
+    precisions = jax.random.uniform(jax.random.key(1), (BATCH, 9), minval=0.1, maxval=4.0)
+    valid = jnp.arange(9) < 3 + jnp.arange(BATCH)[:, None]
+    encoder = Attention(widths=(), heads=1, values=1)
+    params = {
+        "read": [],
+        "score": {"w": jnp.array([[0.0], [1.0]]), "b": jnp.zeros(1)},
+        "value": {"w": jnp.array([[1.0], [0.0]]), "b": jnp.zeros(1)},
+    }
+    assert jax.tree.map(jnp.shape, params) == jax.tree.map(jnp.shape, encoder.init(jax.random.key(2), 2))
+    mean, total = encoder.apply(params, jnp.stack([estimates, jnp.log(precisions)], -1), valid).T
+    precisions = jnp.where(valid, precisions, 0.0)
+    assert jnp.allclose(mean, (precisions * estimates).sum(1) / precisions.sum(1), atol=1e-5)
+    assert jnp.allclose(jnp.exp(total), precisions.sum(1), rtol=1e-5)
 
 
 def test_unknown_encoder_names_the_near_miss():

@@ -64,7 +64,7 @@ def test_pool_weights_turn_pooled_draws_into_draws_of_the_target():
     both = jax.tree.map(lambda a, b: jnp.stack([a, b, b]), wide, target)
     keys = jax.random.split(jax.random.key(0), (2, 4000))
     thetas = jnp.stack([jax.vmap(wide.sample)(keys[0]), jax.vmap(target.sample)(keys[1]), jnp.full((4000, 1), 9.0)])
-    w = pool_weights(thetas, both, jnp.array([1.0, 1.0, 0.0]), target)
+    w = pool_weights(thetas, both, jnp.array([True, True, False]), target)
     assert w.max() <= 1.0 and (w[2] == 0).all()
     mean = (w[..., None] * thetas).sum((0, 1)) / w.sum()
     sd = jnp.sqrt((w[..., None] * (thetas - mean) ** 2).sum((0, 1)) / w.sum())
