@@ -23,9 +23,9 @@ from trials import gather, resume
 
 from bayessim_jax import online
 from bayessim_jax.cli.options import HABITS
-from bayessim_jax.cli.plan import INFERENCES
+from bayessim_jax.cli.plan import INFERENCES, make_estimator
 from bayessim_jax.engines.gymnasium import gymnasium_target
-from bayessim_jax.inference import Schedule, recurrent_mixture
+from bayessim_jax.inference import Schedule
 from bayessim_jax.learning import default_learner
 from bayessim_jax.learning.her import Her
 from bayessim_jax.systems import lookup
@@ -78,11 +78,11 @@ def _trial(name: str, scheme: str, args: argparse.Namespace) -> tuple[Callable[[
     entry, habits = lookup(name), dict(HABITS[name])
     system, task = entry.system(noise=habits.pop("noise")), entry.task()
     learner, sizes = default_learner(name, system, task), habits | {"evaluations": args.episodes}
-    estimator = recurrent_mixture()
+    schedule = Schedule(epochs=5) if args.small else None
+    estimator = make_estimator(sizes.pop("encoder"), system, schedule=schedule)
     if args.small:
         learner = Her.create(system, task, 2, envs=2, updates=2, widths=(8,))
         sizes |= {"warmup": 1, "simulations": 20, "steps": 10, "pool": 2, "history": 2, "calibrations": 8}
-        estimator = recurrent_mixture(schedule=Schedule(epochs=5))
     setup = online.Setup.create(system, learner, task, estimator=estimator, inferences=INFERENCES[scheme], **sizes)
     box = system.parameters
     run = jax.jit(online.run, static_argnames="rounds")

@@ -25,8 +25,9 @@ from trials import gather, kept, trials
 
 from bayessim_jax import online
 from bayessim_jax.cli.options import HABITS
+from bayessim_jax.cli.plan import make_estimator
 from bayessim_jax.engines.gymnasium import gymnasium_target
-from bayessim_jax.inference import Schedule, fourier_mixture, recurrent_mixture, summary_mixture
+from bayessim_jax.inference import Schedule
 from bayessim_jax.learning import DEFAULTS, LEARNERS
 from bayessim_jax.systems import lookup
 
@@ -40,12 +41,12 @@ PAPER = {
 }
 """What the paper gives: online, RFF and epsilon-free; for each pair of axes that it judges."""
 COLUMNS = {
-    "default": (recurrent_mixture, "corrected", 0),
-    "paper": (recurrent_mixture, "paper", 0),
-    "rff": (fourier_mixture, "corrected", 1),
-    "epsilon_free": (summary_mixture, "corrected", 2),
+    "default": ("", "corrected", 0),
+    "paper": ("", "paper", 0),
+    "rff": ("fourier", "corrected", 1),
+    "epsilon_free": ("summary", "corrected", 2),
 }
-"""Estimator, proposals, and which of the paper's figures stands beside it."""
+"""Encoder, or the system's default, proposals, and which of the paper's figures stands beside it."""
 
 SMALL = {
     "ppo": {"episodes": 4, "episode_steps": 20, "envs": 4, "horizon": 20, "epochs": 1, "minibatches": 1},
@@ -84,15 +85,17 @@ def main() -> None:
         entry, habits = lookup(row), dict(HABITS.get(row, {}))
         rounds = args.rounds or habits.pop("rounds", 30)
         habits.pop("rounds", None)
+        usual = habits.pop("encoder", "pooled_lstm")
         system = entry.system(noise=habits.pop("noise", 0.01))
         task, box = entry.task(), system.parameters
         name, settings = DEFAULTS[row]
         learner = LEARNERS[name].create(system, task, **(settings | (SMALL[name] if args.small else {})))
         for column in args.columns:
-            estimator, proposal, theirs = COLUMNS[column]
-            fit = {"schedule": Schedule(epochs=5)} if args.small else {}
+            encoder, proposal, theirs = COLUMNS[column]
+            schedule = Schedule(epochs=5) if args.small else None
+            estimator = make_estimator(encoder or usual, system, schedule=schedule)
             sizes = habits | (TINY if args.small else {})
-            setup = online.Setup.create(system, learner, task, estimator=estimator(**fit), proposal=proposal, **sizes)
+            setup = online.Setup.create(system, learner, task, estimator=estimator, proposal=proposal, **sizes)
             target = partial(gymnasium_target, row, noise=system.noise) if row == "hopper" else None
             labels = {"row": row, "column": column, "small": args.small}
             if args.kept:

@@ -24,7 +24,7 @@ from bayessim_jax.engines.gymnasium import GYMNASIUM, gymnasium_target
 from bayessim_jax.engines.rescored import Rescored
 from bayessim_jax.engines.simulated import SimulatedTarget
 from bayessim_jax.inference.encoders import features_of
-from bayessim_jax.inference.estimators import fourier_mixture, recurrent_mixture, summary_mixture
+from bayessim_jax.inference.estimators import MixtureDensity, fourier_mixture, recurrent_mixture, summary_mixture
 from bayessim_jax.inference.fit import Schedule
 from bayessim_jax.programs import compile_once
 from bayessim_jax.recordings.truths import Truths
@@ -33,7 +33,7 @@ from bayessim_jax.spelling import find_named, near_miss
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-__all__ = ["Plan", "make_plan"]
+__all__ = ["Plan", "make_estimator", "make_plan"]
 
 TRUTH = 0x7275
 INFERENCES = {"online": online.FOREVER, "offline": 1, "uniform": 0}
@@ -176,7 +176,7 @@ def _make_plan(settings: Settings) -> Plan:
         system,
         learner,
         task,
-        estimator=_estimator(settings, system, Schedule(**pace)),
+        estimator=make_estimator(settings.encoder, system, settings.components, Schedule(**pace)),
         proposal=settings.proposal,
         replay=planned,
         forget=settings.forget,
@@ -226,12 +226,13 @@ def _target(kind: str, settings: Settings, system: Any, task: Any, vehicle: Any,
     return Rescored(target, system, task, hidden) if rescored else target
 
 
-def _estimator(settings: Settings, system: Any, schedule: Schedule) -> Any:
-    if settings.encoder == "fourier":
-        return fourier_mixture(actions=system.actions.size, components=settings.components, schedule=schedule)
-    if settings.encoder == "summary":
-        return summary_mixture(actions=system.actions.size, components=settings.components, schedule=schedule)
-    return recurrent_mixture(settings.encoder, settings.components, schedule, features_of(system))
+def make_estimator(encoder: str, system: Any, components: int = 5, schedule: Schedule | None = None) -> MixtureDensity:
+    """What `--encoder` names, for recordings of this system."""
+    if encoder == "fourier":
+        return fourier_mixture(actions=system.actions.size, components=components, schedule=schedule)
+    if encoder == "summary":
+        return summary_mixture(actions=system.actions.size, components=components, schedule=schedule)
+    return recurrent_mixture(encoder, components, schedule, features_of(system))
 
 
 def _check_restart(system: Any, controller: str, learner: str) -> None:
