@@ -24,10 +24,12 @@ def online(words: Sequence[str]) -> int:
             folder.check_free()
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA's remarks on slow compilation
         from bayessim_jax.cli.cache import use_compilation_cache
+        from bayessim_jax.cli.memory import return_large_blocks
         from bayessim_jax.cli.plan import make_plan
         from bayessim_jax.cli.session import Session
 
         use_compilation_cache()
+        return_large_blocks()
         plan = make_plan(command.settings)
         folder.check_writable() if command.resume else folder.create()
     except ValueError as error:
