@@ -326,7 +326,8 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
     pool = _insert(state.pool, done, thetas[:fresh], singles, proposal, jnp.ones(1, bool))
     pairs: Any = _pairs(pool, proposal)
     if state.sets.thetas.size:
-        pairs = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), pairs, _pairs(state.sets, proposal))
+        others = _pairs(state.sets, proposal, before=pairs[0].shape[0])
+        pairs = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), pairs, others)
     weights = pairs[2]
     estimator, fit = setup.estimator.fit(fit_key, state.estimator, *pairs)
 
@@ -346,8 +347,8 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
         state.belief.box,
         correct=setup.proposal.accumulate,
     )
-    served = jax.tree.map(lambda leaf: leaf[: state.sets.thetas.shape[1]], sets)
-    kept = _insert(state.sets, done, thetas[fresh:][: state.sets.thetas.shape[1]], served, proposal, use)
+    first, served = jax.tree.map(lambda leaf: leaf[: state.sets.thetas.shape[1]], (thetas[fresh:], sets))
+    kept = _insert(state.sets, done, first, served, proposal, use)
     q = setup.estimator.posterior(estimator, history, use)
     posterior = setup.proposal.combine(state.belief, proposal, q)
     growth, gap = posterior.against(state.belief)
@@ -424,16 +425,20 @@ def _insert(pool: Pool, done: Array, thetas: Array, recordings: Recording, propo
     return jax.tree.map(lambda leaf, new: leaf.at[slot].set(new), pool, Pool(thetas, recordings, proposal, there))
 
 
-def _pairs(pool: Pool, proposal: Any) -> tuple[Array, Recording, Array, Array]:
-    """Every θ with each of its recordings alone: θ, recordings, weights under the proposal, and which draw of θ."""
+def _pairs(pool: Pool, proposal: Any, before: int = 0) -> tuple[Array, Recording, Array, Array]:
+    """Every θ with each of its recordings alone: θ, recordings, weights, and the number of the draw, from `before` on.
+
+    Also where an axis of recordings is empty (a machine without actuators).
+    """
     slots, n, d = pool.thetas.shape
     size = pool.filled.shape[1]
+    pairs = slots * n * size
     weights = pool_weights(pool.thetas, pool.proposals, pool.filled.any(-1), proposal)
     return (
-        jnp.broadcast_to(pool.thetas[:, :, None], (slots, n, size, d)).reshape(-1, d),
-        jax.tree.map(lambda leaf: leaf.reshape(-1, 1, *leaf.shape[3:]), pool.recordings),
+        jnp.repeat(pool.thetas.reshape(slots * n, d), size, axis=0),
+        jax.tree.map(lambda leaf: leaf.reshape(pairs, 1, *leaf.shape[3:]), pool.recordings),
         (weights[:, :, None] * pool.filled[:, None]).ravel(),
-        jnp.repeat(jnp.arange(slots * n), size),
+        before + jnp.repeat(jnp.arange(slots * n), size),
     )
 
 

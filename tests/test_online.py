@@ -19,8 +19,12 @@ from bayessim_jax.inference.proposals import Corrected
 from bayessim_jax.learning import Fixed, Ppo, RandomPolicy, RecordedActions, default_learner
 from bayessim_jax.rollout import rollout
 from bayessim_jax.systems import Balance, CartPole, Pendulum, SkidSteer, Upswing, from_functions
+from bayessim_jax.systems.mjcf import Unknown, mjcf_system
 
 TINY = MixtureDensity(Lstm(8, frame=4), MixtureHead(2, 8), Schedule(epochs=10, draws=32, batch=16), members=1, folds=4)
+
+SWINGING = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="1"/></body></worldbody></mujoco>"""
 
 OPTIONS = online.COMPILER_OPTIONS | {"xla_cpu_use_fusion_emitters": True}
 """What is equal bit for bit is compiled as users compile it, and not as quickly as the rest of the quick tests."""
@@ -85,13 +89,25 @@ def test_kept_sets_are_fitted_from_the_next_round_on_where_they_tell_of_recordin
     for (thetas, seen, weights, draws), counts in zip(given, ((0, 0), (1, 0), (1, 2)), strict=True):
         assert len(thetas) == len(seen) == len(weights) == len(draws) == 2 * 32 + 2 * 5 * 4
         assert ((weights[64:] > 0).reshape(2, 5, 4).sum(-1) == np.array(counts)[:, None]).all()
-        assert (draws[64:] == np.repeat(np.arange(10), 4)).all() and (draws[:64] == np.arange(64)).all()
+        assert (draws[64:] == 64 + np.repeat(np.arange(10), 4)).all() and (draws[:64] == np.arange(64)).all()
     *_, (thetas, seen, _, _) = given
     kept = thetas[64:].reshape(2, 5, 4, -1)
     assert (kept == kept[:, :, :1]).all() and np.ptp(kept[:, :, 0], 1).min() > 0
     of_two = seen[64:].reshape(2, 5, 4, *seen.shape[-2:])[1, :, :2]
     assert not np.allclose(of_two[:, 0], of_two[:, 1])
     assert state.sets.filled.tolist() == [[True] * 3 + [False], [True] * 2 + [False] * 2]
+
+
+def test_sets_of_a_machine_without_actuators_are_kept_too():
+    unknown = Unknown("damping", ("joint/hinge/damping",), 0.0, 0.2, "N m s/rad")
+    system = mjcf_system(SWINGING, [unknown])
+    sizes = {"steps": 16, "simulations": 32, "pool": 2, "history": 4, "calibrations": 16, "kept": 5}
+    setup = online.Setup.create(system, Fixed(RandomPolicy(system.actions)), estimator=TINY, **sizes)
+    state = jax.eval_shape(lambda: online.init(jax.random.key(0), setup))
+    recordings = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((1, *leaf.shape[1:]), leaf.dtype), state.history)
+    assert recordings.actions.shape == (1, 16, 0)
+    after, _ = jax.eval_shape(lambda s, r: online.update(jax.random.key(1), setup, s, r), state, recordings)
+    assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, state)
 
 
 def test_one_recording_beside_a_readout_of_sets_is_what_the_networks_say(cartpole):

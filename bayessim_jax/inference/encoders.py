@@ -208,7 +208,7 @@ class Attention:
         size = (self.widths or (features,))[-1]
         return {
             "read": _layers(keys, features, self.widths),
-            "score": {"w": 0.1 * glorot(score_key, size, self.heads), "b": jnp.zeros(self.heads)},
+            "score": jax.tree.map(lambda leaf: 0.1 * leaf, _dense(score_key, size, self.heads)),
             "value": _dense(value_key, size, self.heads * self.values),
         }
 
