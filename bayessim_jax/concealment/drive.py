@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from bayessim_jax.concealment.motions import Motion, draw_motions
 from bayessim_jax.concealment.places import driven_joint, dry_geoms
-from bayessim_jax.concealment.world import FINE, RunawayError, build, simulate
+from bayessim_jax.concealment.world import RunawayError, build, count_substeps, simulate
 
 __all__ = ["Drive", "find_drive"]
 
@@ -98,8 +98,8 @@ def find_drive(model: mujoco.MjModel, kind: str, stride: int) -> Drive:
 
 def _reached(model: mujoco.MjModel, drive: Drive, motions: list[Motion]) -> Float[np.ndarray, " nu"]:
     """What 95 % of the distances from home stay below, at every actuator's joint."""
-    plain = build(model, ())
-    away = [np.abs(simulate(plain, (), drive, m).qpos[:: 2 * FINE, drive.q] - drive.home[drive.q]) for m in motions]
+    plain, every = build(model, ()), 2 * count_substeps(model.opt.timestep)
+    away = [np.abs(simulate(plain, (), drive, m).qpos[::every, drive.q] - drive.home[drive.q]) for m in motions]
     return np.quantile(np.concatenate(away), 0.95, axis=0)
 
 

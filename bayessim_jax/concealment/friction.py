@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from bayessim_jax.concealment.bristle import STIFF, Bristle
+from bayessim_jax.concealment.bristle import STIFF, draw_rounding, grip
 from bayessim_jax.concealment.law import ForceLaw, Spot
 from bayessim_jax.concealment.places import driven_joints
 
@@ -25,6 +25,10 @@ __all__ = [
     "StribeckFriction",
     "ViscousFriction",
 ]
+
+
+SHARP = 0.2
+"""Of Stribeck's velocity: a sign that is rounded over more of it hides what falls there."""
 
 
 @dataclass
@@ -63,81 +67,91 @@ class QuadraticDrag(ForceLaw):
 
 @dataclass
 class CoulombFriction(ForceLaw):
-    """τ = −F_c sign(v) in motion, at rest what holds the joint: a stiff bristle that slips at F_c."""
+    """τ = −F_c sign(v), at rest what holds the joint: a stiff bristle that slips at F_c; or −F_c tanh(v/ε)."""
 
     name = "coulomb_friction"
     coulomb: float
+    rounding: float = 0.0
 
     @classmethod
     def make(cls, spot: Spot, amplitude: float, rng: np.random.Generator) -> CoulombFriction:
         """F_c in units of the joint's force."""
-        return cls(spot, amplitude * spot.force)
+        level = amplitude * spot.force
+        return cls(spot, level, draw_rounding(spot, level, rng))
 
     def begin(self, world: World, rng: np.random.Generator) -> None:
-        """With a bristle that is not bent."""
-        self._bristle = Bristle(self.spot.inertia, world.h)
+        """With bristles that are not bent."""
+        self._grip = grip(self.spot, self.rounding)
 
     def force(self, world: World, q: float, v: float) -> float:
-        """The bristle's."""
-        return self._bristle.pull(v, self.coulomb, self.coulomb)
+        """The bristles', or that of a rounded sign."""
+        return self._grip.pull(v, self.coulomb, self.coulomb)
 
 
 @dataclass
 class StribeckFriction(ForceLaw):
-    """A stiff bristle that slips at g(v) = F_c + (F_s − F_c)/(1 + (v/v_s)²)."""
+    """A stiff bristle that slips at g(v) = F_c + (F_s − F_c)/(1 + (v/v_s)²), or −g(v) tanh(v/ε)."""
 
     name = "stribeck_friction"
     coulomb: float
     static: float
     velocity: float
+    rounding: float = 0.0
 
     @classmethod
     def make(cls, spot: Spot, amplitude: float, rng: np.random.Generator) -> StribeckFriction:
         """F_c in units of the joint's force, F_s 1.6 to 2.2 times as much, v_s 8 to 15 % of the joint's speed."""
         coulomb = 0.8 * amplitude * spot.force
-        return cls(spot, coulomb, rng.uniform(1.6, 2.2) * coulomb, rng.uniform(0.08, 0.15) * spot.speed)
+        static, velocity = rng.uniform(1.6, 2.2) * coulomb, rng.uniform(0.08, 0.15) * spot.speed
+        return cls(spot, coulomb, static, velocity, min(draw_rounding(spot, static, rng), SHARP * velocity))
 
     def begin(self, world: World, rng: np.random.Generator) -> None:
-        """With a bristle that is not bent."""
-        self._bristle = Bristle(self.spot.inertia, world.h)
+        """With bristles that are not bent."""
+        self._grip = grip(self.spot, self.rounding)
 
     def force(self, world: World, q: float, v: float) -> float:
-        """The bristle's."""
+        """The bristles', or that of a rounded sign."""
         level = self.coulomb + (self.static - self.coulomb) / (1.0 + (v / self.velocity) ** 2)
-        return self._bristle.pull(v, level, level)
+        return self._grip.pull(v, level, level)
 
 
 @dataclass
 class AsymmetricFriction(ForceLaw):
-    """A stiff bristle that slips at F₊ where v > 0 and at F₋ where v < 0."""
+    """A stiff bristle that slips at F₊ where v > 0 and at F₋ where v < 0, or −F± tanh(v/ε)."""
 
     name = "asymmetric_friction"
     positive: float
     negative: float
+    rounding: float = 0.0
 
     @classmethod
     def make(cls, spot: Spot, amplitude: float, rng: np.random.Generator) -> AsymmetricFriction:
         """One level in units of the joint's force, the other 30 to 60 % of it."""
         large = 1.2 * amplitude * spot.force
         small = rng.uniform(0.3, 0.6) * large
-        return cls(spot, *((large, small) if rng.uniform() < 0.5 else (small, large)))
+        levels = (large, small) if rng.uniform() < 0.5 else (small, large)
+        return cls(spot, *levels, draw_rounding(spot, large, rng))
 
     def begin(self, world: World, rng: np.random.Generator) -> None:
-        """With a bristle that is not bent."""
-        self._bristle = Bristle(self.spot.inertia, world.h)
+        """With bristles that are not bent."""
+        self._grip = grip(self.spot, self.rounding)
 
     def force(self, world: World, q: float, v: float) -> float:
-        """The bristle's."""
-        return self._bristle.pull(v, self.negative, self.positive)
+        """The bristles', or that of a rounded sign."""
+        return self._grip.pull(v, self.negative, self.positive)
 
 
 @dataclass
 class LoadDependentFriction(ForceLaw):
-    """A stiff bristle that slips at F_c + K √(τ² + ε²), τ what the motors exert: ε 1 % of the joint's force."""
+    """A stiff bristle that slips at F_c + K √(τ² + ε²), τ what the motors exert: ε 1 % of the joint's force.
+
+    Or that level times −tanh(v/ε_v).
+    """
 
     name = "load_dependent_friction"
     coulomb: float
     gain: float
+    rounding: float = 0.0
 
     @classmethod
     def places(cls, model: mujoco.MjModel) -> list[str]:
@@ -147,16 +161,17 @@ class LoadDependentFriction(ForceLaw):
     @classmethod
     def make(cls, spot: Spot, amplitude: float, rng: np.random.Generator) -> LoadDependentFriction:
         """K, and F_c 15 to 40 % of K times the joint's force."""
-        return cls(spot, rng.uniform(0.15, 0.4) * amplitude * spot.force, amplitude)
+        level = rng.uniform(0.15, 0.4) * amplitude * spot.force
+        return cls(spot, level, amplitude, draw_rounding(spot, amplitude * spot.force, rng))
 
     def begin(self, world: World, rng: np.random.Generator) -> None:
-        """With a bristle that is not bent."""
-        self._bristle = Bristle(self.spot.inertia, world.h)
+        """With bristles that are not bent."""
+        self._grip = grip(self.spot, self.rounding)
 
     def force(self, world: World, q: float, v: float) -> float:
-        """The bristle's."""
+        """The bristles', or that of a rounded sign."""
         level = self.coulomb + self.gain * math.hypot(world.motor(self.spot.joint), 0.01 * self.spot.force)
-        return self._bristle.pull(v, level, level)
+        return self._grip.pull(v, level, level)
 
 
 @dataclass

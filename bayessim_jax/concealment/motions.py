@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from bayessim_jax.concealment.world import FINE
+from bayessim_jax.concealment.world import count_substeps
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -89,7 +89,8 @@ def draw_motions(
 
     Sample times scatter by `jitter` times the distance of rows, uniformly.
     """
-    fine = FINE * stride
+    substeps = count_substeps(h)
+    fine = substeps * stride
     motions = []
     for k in range(recordings):
         name = ("sines", "chirp", "steps")[k % 3] if kind == "mixed" else kind
@@ -108,7 +109,7 @@ def draw_motions(
                 + drive.scatter * rng.uniform(0.3, 1, len(drive.home)) * rng.choice([-1, 1], len(drive.home)),
                 qvel=drive.swing * rng.uniform(-1, 1, len(drive.swing)),
                 marks=np.arange(rows) * fine + shift,
-                lead=round(LEAD * FINE / h),
+                lead=round(LEAD * substeps / h),
                 steps=rows * fine,
                 seed=(int(rng.integers(2**31)), k),
             )

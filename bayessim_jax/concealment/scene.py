@@ -14,7 +14,7 @@ from bayessim_jax.concealment.law import Spot
 from bayessim_jax.concealment.masses import link_axes
 from bayessim_jax.concealment.motions import draw_motions
 from bayessim_jax.concealment.places import driven_joint, find_joint, nearest_joint
-from bayessim_jax.concealment.world import FINE, Track, build, simulate
+from bayessim_jax.concealment.world import Track, build, count_substeps, simulate
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -65,7 +65,8 @@ class Scene:
         elif kind == "geom":
             geom = int(m.geom(name).id)
             joint = nearest_joint(m, int(m.geom_bodyid[geom]))
-        size = {"h": float(m.opt.timestep) / FINE, "duration": self.motions[0].steps * float(m.opt.timestep) / FINE}
+        h = float(m.opt.timestep) / count_substeps(m.opt.timestep)
+        size = {"h": h, "duration": self.motions[0].steps * h}
         if body > 0:
             anchor, along, _ = link_axes(m, body)
             reach = abs(float((m.body_ipos[body] - anchor) @ along))

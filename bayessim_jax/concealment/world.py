@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -20,10 +21,10 @@ if TYPE_CHECKING:
     from bayessim_jax.concealment.law import Law
     from bayessim_jax.concealment.motions import Motion
 
-__all__ = ["FINE", "RunawayError", "Track", "World", "build", "simulate"]
+__all__ = ["RunawayError", "Track", "World", "build", "count_substeps", "simulate"]
 
-FINE = 4
-"""Steps of a world in one of the model's."""
+FINE, LONGEST = 4, 5e-4
+"""Steps of a world in one of the model's, at least, and s, the longest that they may be, for joints that stick."""
 WILD = 1e3
 """rad/s or m/s at which a machine has run away."""
 
@@ -85,10 +86,15 @@ class World:
         return total
 
 
+def count_substeps(h: float) -> int:
+    """Steps of a world in one of h seconds of the model."""
+    return max(FINE, math.ceil(h / LONGEST * (1 - 1e-9)))
+
+
 def build(model: mujoco.MjModel, laws: Sequence[Law]) -> mujoco.MjModel:
     """A copy of a model on the fine grid, with what laws make of its numbers."""
     fine = copy.copy(model)
-    fine.opt.timestep = model.opt.timestep / FINE
+    fine.opt.timestep = model.opt.timestep / count_substeps(model.opt.timestep)
     edits = [law for law in laws if isinstance(law, ModelLaw)]
     for law in edits:
         law.edit(fine)

@@ -38,6 +38,7 @@ CONTAINS = {
     "asymmetric_friction": ("coulomb_friction",),
     "load_dependent_friction": ("coulomb_friction",),
     "lugre_friction": ("coulomb_friction", "stribeck_friction"),
+    "hysteresis": ("coulomb_friction",),
     "gain_drop": ("actuator_gain",),
     "gain_drift": ("actuator_gain",),
     "joint_flexibility": ("armature",),
@@ -97,6 +98,8 @@ class Thresholds:
     """Standard errors within which two candidates predict held-out windows alike."""
     blur: float = 0.005
     """Share of what the best candidate gains by which others may be worse and tie, where it is not wholly right."""
+    form: float = 0.001
+    """Share of the misfit that a special case may leave and be the finding: the form of laws is no better known."""
     least: float = 4.0
     """Nats in all by which a candidate has to be worse to be out of the confusion set."""
     ceiling: float = 0.9
@@ -234,7 +237,7 @@ def decide(
     result = Diagnosis("unexplained", bench, none, entries, screened=screened)
     if not entries or entries[0].score - none.score < thresholds.least:
         return result
-    tied = [entry for entry in entries if ties(entry, entries[0], none, thresholds)]
+    tied = _tied(entries, none, thresholds)
     # what more effects explain has to be worth them: another law of the same effect leaves a rest, too
     tied += [entry for entry in entries if entry not in tied and _suffices(entry, tied, none, thresholds)]
     tied = [entry for entry in tied if explains(entry, none, thresholds) and is_worth(entry, entries, none, thresholds)]
@@ -258,8 +261,17 @@ def decide(
 
 def may_be_named(entry: Entry, entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:
     """Whether a candidate ties for the best of `entries`, which comes first, or is a part of one that does."""
-    tied = (other for other in entries if ties(other, entries[0], none, thresholds))
-    return any(set(entry.names) <= set(other.names) for other in tied)
+    return any(set(entry.names) <= set(other.names) for other in _tied(entries, none, thresholds))
+
+
+def _tied(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> list[Entry]:
+    """What predicts as well as the best, which comes first, and special cases of that which leave next to nothing.
+
+    What these leave says less of physics than of how a sign is rounded, in the library and in a machine.
+    """
+    tied = [entry for entry in entries if ties(entry, entries[0], none, thresholds)]
+    simpler = (entry for entry in entries if share_left(entry.misfit, none.misfit) <= thresholds.form)
+    return tied + [e for e in simpler if e not in tied and any(has_special_case(other, e) for other in tied)]
 
 
 def explains(entry: Entry, none: Entry, thresholds: Thresholds) -> bool:

@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
-import mujoco
-
-from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Scales, Values
-from bayessim_jax.effects.places import joints
+from bayessim_jax.effects.contract import EffectParameter, Memory, Moment, Number, Scales, Values
+from bayessim_jax.effects.dry_friction import DryFriction
 
 __all__ = ["AsymmetricFriction"]
 
 
-class AsymmetricFriction(ForceEffect):
+class AsymmetricFriction(DryFriction):
     """τ = −F₊ for v > 0 and F₋ for v < 0; at rest whatever holds the joint between the two.
 
     τ = −clip(m (v/h + a), −F₋, F₊), in N m or N. It is Coulomb friction (F₊ + F₋)/2 with a constant force (F₋ − F₊)/2.
     """
 
     name = "asymmetric_friction"
-    holds = True
 
-    def places(self, model: mujoco.MjModel) -> list[str]:
-        """Every hinge and slide."""
-        return joints(model)
-
-    def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
+    def levels(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """F₊ and F₋, the levels against motion in the positive and in the negative direction."""
         force = scales.force
         return (
@@ -34,4 +26,4 @@ class AsymmetricFriction(ForceEffect):
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
         """Opposes motion, or holds."""
-        return -jnp.clip(moment.stop, -values["negative"], values["positive"]), memory
+        return self.resist(values, moment, values["positive"], values["negative"]), memory

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
-import mujoco
-
-from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Scales, Values
-from bayessim_jax.effects.places import joints
+from bayessim_jax.effects.contract import EffectParameter, Memory, Moment, Number, Scales, Values
+from bayessim_jax.effects.dry_friction import DryFriction
 
 __all__ = ["CoulombFriction"]
 
 
-class CoulombFriction(ForceEffect):
+class CoulombFriction(DryFriction):
     """τ = −F_c sign(v) in motion; at rest whatever holds the joint, up to F_c.
 
     τ = −clip(m (v/h + a), ±F_c): what would stop the joint within the time step, and no more than the friction has.
@@ -19,17 +16,12 @@ class CoulombFriction(ForceEffect):
     """
 
     name = "coulomb_friction"
-    holds = True
 
-    def places(self, model: mujoco.MjModel) -> list[str]:
-        """Every hinge and slide."""
-        return joints(model)
-
-    def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
+    def levels(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The level F_c."""
         return (EffectParameter("coulomb", scales.force_unit, 0.0, scales.force, 0.0, 0.1 * scales.force, form=0.01),)
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
         """Opposes motion, or holds."""
         level = values["coulomb"]
-        return -jnp.clip(moment.stop, -level, level), memory
+        return self.resist(values, moment, level, level), memory

@@ -5,13 +5,14 @@ from __future__ import annotations
 import jax.numpy as jnp
 import mujoco
 
-from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Scales, Values
+from bayessim_jax.effects.contract import EffectParameter, Memory, Moment, Number, Scales, Values
+from bayessim_jax.effects.dry_friction import DryFriction
 from bayessim_jax.effects.places import driven_joints
 
 __all__ = ["LoadDependentFriction"]
 
 
-class LoadDependentFriction(ForceEffect):
+class LoadDependentFriction(DryFriction):
     """τ = −(F_c + K |τ_load|) sign(v) in motion, at rest whatever holds the joint up to that.
 
     τ_load is what the actuators exert on the joint through its transmission: gear · clip(gain u + bias). F_c in N m or
@@ -21,13 +22,12 @@ class LoadDependentFriction(ForceEffect):
     """
 
     name = "load_dependent_friction"
-    holds = True
 
     def places(self, model: mujoco.MjModel) -> list[str]:
         """Every hinge and slide that an actuator drives."""
         return driven_joints(model)
 
-    def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
+    def levels(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """F_c and K."""
         force = scales.force
         return (
@@ -38,4 +38,4 @@ class LoadDependentFriction(ForceEffect):
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
         """Opposes motion, or holds."""
         level = values["coulomb"] + values["gain"] * jnp.abs(moment.drive)
-        return -jnp.clip(moment.stop, -level, level), memory
+        return self.resist(values, moment, level, level), memory

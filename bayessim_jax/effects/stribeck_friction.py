@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-import mujoco
 
-from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Scales, Values
-from bayessim_jax.effects.places import joints
+from bayessim_jax.effects.contract import EffectParameter, Memory, Moment, Number, Scales, Values
+from bayessim_jax.effects.dry_friction import DryFriction
 
 __all__ = ["StribeckFriction"]
 
 
-class StribeckFriction(ForceEffect):
+class StribeckFriction(DryFriction):
     """τ = −F(v) sign(v) in motion, at rest whatever holds the joint up to F_s.
 
         F(v) = F_c + max(F_s − F_c, 0) exp(−(v/v_s)²)
@@ -22,13 +21,8 @@ class StribeckFriction(ForceEffect):
     """
 
     name = "stribeck_friction"
-    holds = True
 
-    def places(self, model: mujoco.MjModel) -> list[str]:
-        """Every hinge and slide."""
-        return joints(model)
-
-    def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
+    def levels(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """F_c, F_s and v_s."""
         force, speed = scales.force, scales.speed
         return (
@@ -52,4 +46,4 @@ class StribeckFriction(ForceEffect):
         ratio = moment.velocity / values["velocity"]
         coulomb = values["coulomb"]
         level = coulomb + jnp.maximum(values["static"] - coulomb, 0.0) * jnp.exp(-ratio * ratio)
-        return -jnp.clip(moment.stop, -level, level), memory
+        return self.resist(values, moment, level, level), memory

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bayessim_jax.diagnosis.flexible import FLEXIBLE
-from bayessim_jax.effects import Scales, lookup_effect, with_effects
+from bayessim_jax.effects import Scales, lookup_effect, open_form, with_effects
 from bayessim_jax.inference.replay import replay_window
 from bayessim_jax.inference.scores import compare, score
 from bayessim_jax.recordings.assemble import read_recording
@@ -42,7 +42,8 @@ def write_state(folder: RunFolder, diagnosis: CaseDiagnosis) -> None:
             entry = diagnosis.result.baseline if name == "baseline" else diagnosis.result.best
             own, candidate, x = bench, entry.candidate, entry.fit.z
         entries[name] = {
-            "effects": [[own.pairs[k][0].name, own.pairs[k][1]] for k in candidate.effects],
+            "effects": [[effect.name, place] for effect, place in (own.pairs[k] for k in candidate.effects)],
+            "rounded": [getattr(own.pairs[k][0], "rounded", False) for k in candidate.effects],
             "theta": np.asarray(own.margins.theta(x[: own.d])).tolist(),
             "values": list(own.values(candidate, x).values()),
             "spread": diagnosis.spreads[name].tolist(),
@@ -70,9 +71,10 @@ def simulator_of(model: CaseModel, state: dict[str, Any], name: str) -> tuple[An
     """
     entry = state["simulators"][name]
     scales = {place: Scales(**table) for place, table in state["scales"].items()}
-    pairs = [
-        (FLEXIBLE if effect == FLEXIBLE.name else lookup_effect(effect), place) for effect, place in entry["effects"]
-    ]
+    pairs = []
+    for (name, place), rounded in zip(entry["effects"], entry["rounded"], strict=True):
+        effect = FLEXIBLE if name == FLEXIBLE.name else lookup_effect(name)
+        pairs.append((open_form(effect) if rounded else effect, place))
     plain: Any = model.system
     system = with_effects(plain, pairs, scales) if pairs else plain
     theta = [*entry["theta"], *entry["values"]]

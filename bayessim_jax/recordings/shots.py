@@ -115,9 +115,11 @@ class CaseModel:
         joints = [(q, v) for _, q, v in self.case.layout.single]
         return dataclasses.replace(self, recordings=smooth_recordings(self.recordings, joints))
 
-    def windows(self, which: Sequence[int], horizon: float | None = None, stride: float | None = None) -> Windows:
-        """Windows of some of the recordings; `recording` numbers them among all."""
-        windows = stack_windows([self.recordings[i] for i in which], horizon or self.case.case.horizon, stride)
+    def windows(
+        self, which: Sequence[int], horizon: float | None = None, stride: float | None = None, lead: float = 0.0
+    ) -> Windows:
+        """Windows of some of the recordings; `recording` numbers them among all, `lead` is that of `find_windows`."""
+        windows = stack_windows([self.recordings[i] for i in which], horizon or self.case.case.horizon, stride, lead)
         return dataclasses.replace(windows, recording=np.asarray(which)[windows.recording])
 
     def shots(self, windows: Windows) -> Shots:
@@ -328,12 +330,13 @@ def predictor(model: CaseModel) -> Replay:
     return Replay(model.system, model.margins)
 
 
-def split_windows(model: CaseModel) -> tuple[Windows, Windows]:
+def split_windows(model: CaseModel, lead: float = 0.0) -> tuple[Windows, Windows]:
     """Windows to fit and windows to judge by: of whole recordings left out, or of every fourth window of the one.
 
     About a quarter of the recordings is left out, spread over the list; those without a window count for neither.
+    The first `lead` seconds of each are left out, where that costs little (`find_windows`).
     """
-    every = model.windows(range(len(model.recordings)))
+    every = model.windows(range(len(model.recordings)), lead=lead)
     present = sorted(set(every.recording.tolist()))
     units = every.recording if len(present) > 1 else np.arange(len(every))
     labels = sorted(set(units.tolist()))

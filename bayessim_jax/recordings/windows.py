@@ -44,19 +44,29 @@ class Windows:
         return len(self.start)
 
 
-def find_windows(recording: CaseRecording, horizon: float, stride: float | None = None) -> list[Span]:
+def find_windows(
+    recording: CaseRecording, horizon: float, stride: float | None = None, lead: float = 0.0
+) -> list[Span]:
     """First and last row of every window of `horizon` seconds in a recording.
 
     The next window starts where the last one ended, or `stride` seconds after its start. A window ends at the row
-    nearest to its nominal end; where rows lie so far apart that it would be half as long again, it is not made.
+    nearest to its nominal end; where rows lie so far apart that it would be half as long again, it is not made. The
+    first `lead` seconds are left out, unless that costs more than a quarter of the windows.
     """
+    found = _find_windows(recording, horizon, stride, 0.0)
+    late = _find_windows(recording, horizon, stride, lead) if lead else found
+    return late if 4 * len(late) >= 3 * len(found) else found
+
+
+def _find_windows(recording: CaseRecording, horizon: float, stride: float | None, lead: float) -> list[Span]:
     found, time = [], recording.time
+    begin = int(np.searchsorted(time, time[0] + lead * (1 - 1e-6))) if lead else 0
     starts = np.append(np.flatnonzero(recording.known), len(time))
     for first, last in recording.spans:
         if last - first < 2 or np.median(np.diff(time[first : last + 1])) > horizon:
             continue
         slack = float(np.median(np.diff(time[first : last + 1]))) / 2 * (1 + 1e-6)
-        row = int(starts[np.searchsorted(starts, first)])
+        row = int(starts[np.searchsorted(starts, max(first, begin))])
         while row < last:
             end = time[row] + horizon
             if end > time[last] + slack:
@@ -72,9 +82,11 @@ def find_windows(recording: CaseRecording, horizon: float, stride: float | None 
     return found
 
 
-def stack_windows(recordings: Sequence[CaseRecording], horizon: float, stride: float | None = None) -> Windows:
-    """Every window of several recordings in padded arrays."""
-    found = [(i, r, span) for i, r in enumerate(recordings) for span in find_windows(r, horizon, stride)]
+def stack_windows(
+    recordings: Sequence[CaseRecording], horizon: float, stride: float | None = None, lead: float = 0.0
+) -> Windows:
+    """Every window of several recordings in padded arrays; `lead` is that of `find_windows`."""
+    found = [(i, r, span) for i, r in enumerate(recordings) for span in find_windows(r, horizon, stride, lead)]
     if not found:
         raise ValueError(f"no recording holds {horizon:g} s without a gap; choose a shorter horizon.")
     rows = max(stop - start for _, _, (start, stop) in found) + 1

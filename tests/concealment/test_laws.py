@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from bayessim_jax.concealment import LAWS, StrengthError, choose_place, hide, lookup_law, make_scene
-from bayessim_jax.concealment.bristle import Bristle
-from bayessim_jax.concealment.world import FINE, build
+from bayessim_jax.concealment.bristle import Bristle, RoundSign, draw_rounding
+from bayessim_jax.concealment.world import FINE, LONGEST, build, count_substeps
 from benchmarks.worlds import RIGS
 
 SHORT = {"kind": "mixed", "recordings": 3, "seconds": 2.0, "stride": 2, "jitter": 0.0}
@@ -115,6 +115,17 @@ def test_bristles_take_force_times_distance_and_then_hold():
     assert slide_to_rest(3.0, v=0.0, push=3.3)[1] == pytest.approx(0.3 / 2.0 * 2.0, rel=0.01)
 
 
+def test_half_of_all_dry_friction_has_a_rounded_sign():
+    spot = scene_of("pendulum").spot("joint/hinge")
+    widths = [draw_rounding(spot, 0.1, np.random.default_rng(seed)) for seed in range(200)]
+    drawn = np.array([w for w in widths if w > 0.0]) / spot.speed
+    assert 70 < len(drawn) < 130
+    assert drawn.min() >= 0.004 and drawn.max() <= 0.04
+    sign = RoundSign(0.1)
+    assert sign.pull(10.0, 1.0, 3.0) == pytest.approx(-3.0) and sign.pull(-10.0, 1.0, 3.0) == pytest.approx(1.0)
+    assert sign.pull(1e-3, 1.0, 3.0) == pytest.approx(-3.0 * 0.01, rel=1e-3)
+
+
 def test_friction_takes_no_energy_from_nowhere():
     for name in ("coulomb_friction", "stribeck_friction", "asymmetric_friction", "viscous_friction", "quadratic_drag"):
         _, law = made("pendulum", name, "joint/hinge", 0.3)
@@ -202,3 +213,4 @@ def test_the_world_is_finer_than_the_model_and_begins_before_the_recording():
     assert track.time[1] - track.time[0] == pytest.approx(scene.model.opt.timestep / FINE)
     assert track.time[track.rows[0]] == pytest.approx(0.0) and track.rows[0] > 0
     assert (np.diff(track.rows) == 2 * FINE).all()
+    assert count_substeps(0.002) == FINE and 0.02 / count_substeps(0.02) == pytest.approx(LONGEST)

@@ -47,7 +47,8 @@ def system(xml, body, engine="tree", period=0.01):
 
 def run(base, effects, values, actions, qpos, qvel, theta=0.5, scales=None, **begin):
     """What is observed after each control period, of joints in order: positions, then velocities."""
-    augmented = with_effects(base, [(EFFECTS[name], place) for name, place in effects], scales or Scales())
+    pairs = [(EFFECTS.get(effect, effect), place) for effect, place in effects]
+    augmented = with_effects(base, pairs, scales or Scales())
     parameters = jnp.array([theta, *values], float)
     return simulate(augmented, actions, qpos, qvel, **begin)(parameters)
 

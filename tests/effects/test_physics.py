@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from bayessim_jax.effects import EFFECTS, Scales, with_effects, write_mjcf
+from bayessim_jax.effects import EFFECTS, Scales, open_form, with_effects, write_mjcf
 from bayessim_jax.effects.contract import Past
 from bayessim_jax.effects.mjcf_edits import WRITERS
 from bayessim_jax.systems.mjcf import mjcf_system
@@ -85,6 +85,34 @@ def test_friction_holds_a_pendulum_against_gravity_without_creep(dtype):
         seen = run(base, [("coulomb_friction", "joint/hinge")], [1.05 * load], push(0.0, 1000), 0.8, 0.0)
         assert np.abs(seen[:, 1]).max() < 1e-5
         assert np.abs(seen[:, 0] - 0.8).max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("coulomb_friction", [3.0]),
+        ("asymmetric_friction", [3.0, 1.0]),
+        ("stribeck_friction", [3.0, 3.0, 0.1]),
+        ("load_dependent_friction", [3.0, 0.0]),
+    ],
+)
+@pytest.mark.parametrize("onset", [1e-9, 0.02, 0.2])
+def test_a_rounded_sign_lets_a_joint_creep_below_its_onset_and_no_further(name, values, onset):
+    """Pushed with half the level it moves at half the onset; pushed with more than the level, as with a sharp sign."""
+    rounded = open_form(EFFECTS[name])
+    base = system(cart(0.002, "0 0 -9.81"), "cart")
+    creeping = run(base, [(rounded, RAIL)], [*values, onset], push(1.5, 600), 0.0, 0.0, MASS)
+    assert float(creeping[-1, 1]) == pytest.approx(0.5 * onset, rel=1e-3, abs=1e-8)
+    sliding = run(base, [(rounded, RAIL)], [*values, onset], push(3.5, 600), 0.0, 0.0, MASS)
+    assert float(sliding[-1, 1] - sliding[-101, 1]) == pytest.approx((3.5 - 3.0) / MASS, rel=1e-3)
+
+
+def test_a_form_is_open_only_in_what_asks_for_it():
+    place, scales = "joint/hinge", Scales()
+    assert [p.name for p in EFFECTS["coulomb_friction"].parameters(place, scales)] == ["coulomb"]
+    rounded = open_form(EFFECTS["coulomb_friction"])
+    assert [p.name for p in rounded.parameters(place, scales)] == ["coulomb", "onset"]
+    assert open_form(EFFECTS["viscous_friction"]) is EFFECTS["viscous_friction"]
 
 
 @pytest.mark.parametrize(

@@ -54,9 +54,10 @@ def write_diagnosis(
         "nearest": 1,
         "scales": {"joint/hinge": dataclasses.asdict(Scales())},
         "simulators": {
-            "baseline": {"effects": [], "theta": [0.4], "values": [], **common},
+            "baseline": {"effects": [], "rounded": [], "theta": [0.4], "values": [], **common},
             "augmented": {
-                "effects": [[n, "joint/hinge"] for n, _ in effects], "theta": [mass[0]], "values": values, **common
+                "effects": [[n, "joint/hinge"] for n, _ in effects], "rounded": [False] * len(effects),
+                "theta": [mass[0]], "values": values, **common
             },
         },
     }  # fmt: skip

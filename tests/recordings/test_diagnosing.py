@@ -82,7 +82,8 @@ def test_the_repaired_simulator_is_there_to_train_on(friction):
     run, table, _ = friction
     repaired = load_repaired(run)
     assert (repaired.verdict, repaired.effects) == ("explained", ("coulomb_friction@joint/hinge",))
-    found = [table["parameters"]["rod_mass"]["augmented"], table["effects"][0]["parameters"]["coulomb"]]
+    own = table["effects"][0]["parameters"]
+    found = [table["parameters"]["rod_mass"]["augmented"], own["coulomb"], own["onset"]]
     np.testing.assert_allclose(repaired.mean, [p["mean"] for p in found], rtol=1e-6)
     np.testing.assert_allclose(repaired.sd, [p["sd"] for p in found], rtol=1e-6)
     settings = json.loads((run / "simulators.json").read_text())

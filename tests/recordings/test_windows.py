@@ -35,6 +35,12 @@ def test_without_trouble_everything_is_measured_and_valid(tmp_path):
     assert find_windows(recording, 0.5) == [(50 * k, 50 * k + 50) for k in range(7)]
 
 
+def test_what_follows_on_an_unknown_past_is_left_out_where_that_costs_little(tmp_path):
+    recording = one(tmp_path)
+    assert find_windows(recording, 0.5, lead=0.2) == [(20 + 50 * k, 70 + 50 * k) for k in range(7)]
+    assert find_windows(recording, 1.9, lead=0.2) == [(0, 190), (190, 380)]  # half of them would be lost
+
+
 def test_missing_positions_are_masked_and_filled_in(tmp_path):
     recording = one(tmp_path, (QPOS, [30, 31], np.nan))
     assert np.flatnonzero(~recording.qpos_measured[:, 0]).tolist() == [30, 31]

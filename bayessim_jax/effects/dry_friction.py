@@ -1,0 +1,66 @@
+"""What laws of dry friction share: they hold at rest, and their sign may be rounded."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any
+
+import jax.numpy as jnp
+import mujoco
+
+from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Moment, Number, Scales, Values
+from bayessim_jax.effects.places import joints
+
+__all__ = ["DryFriction", "open_form"]
+
+ONSET = "onset"
+
+
+class DryFriction(ForceEffect):
+    """τ = −F s(v/v₀), s the sign, of a law that is `rounded` a straight line below its onset v₀, in rad/s or m/s.
+
+    Machines are not as sharp as a sign: lubricants, bearings in series and the models of others let friction rise over
+    a range of speeds. Recordings tell that range from a law that falls or bends, such as Stribeck's, only where it may
+    be one. With v' the velocity at the end of the time step, m (v' − v)/h = m a − F s(v'/v₀) has the solution
+
+        τ = −clip(m (v/h + a) F/(F + m v₀/h), −F, F),
+
+    which stops the joint and holds it for v₀ → 0.
+    """
+
+    holds = True
+
+    def __init__(self, rounded: bool = False) -> None:
+        """With `rounded` the onset is one more parameter; otherwise it is 0."""
+        self.rounded = rounded
+
+    def places(self, model: mujoco.MjModel) -> list[str]:
+        """Every hinge and slide."""
+        return joints(model)
+
+    @abstractmethod
+    def levels(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
+        """The parameters of F."""
+
+    def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
+        """Those of F, and the onset v₀ where that is free."""
+        return (*self.levels(place, scales), *((_onset(scales),) if self.rounded else ()))
+
+    def resist(self, values: Values, moment: Moment, positive: Number, negative: Number) -> Number:
+        """The force of the levels against motion in the positive and in the negative direction."""
+        stop = moment.stop
+        if self.rounded:
+            level = jnp.where(jnp.asarray(stop) > 0.0, positive, negative)
+            stop = stop * level / (level + moment.inertia * values[ONSET] / moment.h)
+        return -jnp.clip(stop, -negative, positive)
+
+
+def _onset(scales: Scales) -> EffectParameter:
+    """Some hundredths of the joint's speed at most: beyond that friction is viscous, not dry."""
+    speed = scales.speed
+    return EffectParameter(ONSET, f"{scales.unit}/s", 1e-4 * speed, 0.1 * speed, 0.0, 0.01 * speed, log=True, form=0.5)
+
+
+def open_form(effect: Any) -> Any:
+    """The effect with what the form of its law leaves open as one more parameter; any other effect as it is."""
+    return type(effect)(rounded=True) if isinstance(effect, DryFriction) else effect
