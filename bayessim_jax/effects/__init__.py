@@ -10,8 +10,8 @@ from bayessim_jax.effects.contract import ModelEffect as ModelEffect
 from bayessim_jax.effects.contract import Moment as Moment
 from bayessim_jax.effects.contract import Scales as Scales
 from bayessim_jax.effects.contract import SenseEffect as SenseEffect
-from bayessim_jax.effects.dry_friction import open_form as open_form
 from bayessim_jax.effects.mjcf_edits import write_mjcf as write_mjcf
+from bayessim_jax.effects.open_form import open_form as open_form
 from bayessim_jax.effects.places import at as at
 from bayessim_jax.effects.places import joints as joints
 from bayessim_jax.effects.registry import EFFECTS as EFFECTS

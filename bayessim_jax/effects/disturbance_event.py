@@ -12,31 +12,44 @@ from bayessim_jax.effects.places import joints
 
 __all__ = ["DisturbanceEvent"]
 
+TAPER = "taper"
+
 
 class DisturbanceEvent(ForceEffect):
     """τ = (2 P/w) sin²(π (t − t₀)/w) for t₀ < t < t₁, w = t₁ − t₀: a bump that hands over the impulse P.
 
-    The shape of the push is unknown; a bump without corners stands for it. t in s since the beginning of the recording,
-    P in N m s or N s.
+    The shape of the push is unknown; a bump without corners stands for it. One that is `rounded` is constant but for
+    the share c of its time, the taper, in which it rises and falls as a cosine: c = 1 is the bump, c → 0 a rectangle.
+    t in s since the beginning of the recording, P in N m s or N s.
+
+    Source: Harris 1978 (the tapered cosine)
     """
 
     name = "disturbance_event"
+
+    def __init__(self, rounded: bool = False) -> None:
+        """With `rounded` the taper is one more parameter; otherwise it is 1."""
+        self.rounded = rounded
 
     def places(self, model: mujoco.MjModel) -> list[str]:
         """Every hinge and slide."""
         return joints(model)
 
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
-        """t₀, t₁ and P."""
+        """t₀, t₁ and P; the taper where that is free."""
         duration, impulse = scales.duration, 12.0 * scales.inertia * scales.speed
         return (
             EffectParameter("start", "s", 0.0, duration, 0.45 * duration, 0.45 * duration, scan=8, form=0.05),
             EffectParameter("end", "s", 0.0, duration, 0.55 * duration, 0.55 * duration, scan=8, form=0.05),
             EffectParameter("impulse", f"{scales.force_unit} s", -impulse, impulse, 0.0, 0.02 * impulse, form=0.01),
+            *((EffectParameter(TAPER, "", 0.05, 1.0, 1.0, 0.6, form=0.3),) if self.rounded else ()),
         )
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
         """The bump in the middle of the time step."""
         width = jnp.maximum(values["end"] - values["start"], 3.0 * moment.h)
         phase = jnp.clip((moment.time + 0.5 * moment.h - values["start"]) / width, 0.0, 1.0)
-        return values["impulse"] / width * (1.0 - jnp.cos(2.0 * math.pi * phase)), memory
+        taper = values[TAPER] if self.rounded else 1.0
+        rise = jnp.clip(jnp.minimum(phase, 1.0 - phase) / taper, 0.0, 0.5)
+        height = values["impulse"] / (width * (1.0 - 0.5 * taper))
+        return 0.5 * height * (1.0 - jnp.cos(2.0 * math.pi * rise)), memory

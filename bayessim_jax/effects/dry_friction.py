@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any
 
 import jax.numpy as jnp
 import mujoco
@@ -11,7 +10,7 @@ import mujoco
 from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Moment, Number, Scales, Values
 from bayessim_jax.effects.places import joints
 
-__all__ = ["DryFriction", "open_form"]
+__all__ = ["DryFriction"]
 
 ONSET = "onset"
 
@@ -59,8 +58,3 @@ def _onset(scales: Scales) -> EffectParameter:
     """Some hundredths of the joint's speed at most: beyond that friction is viscous, not dry."""
     speed = scales.speed
     return EffectParameter(ONSET, f"{scales.unit}/s", 1e-4 * speed, 0.1 * speed, 0.0, 0.01 * speed, log=True, form=0.5)
-
-
-def open_form(effect: Any) -> Any:
-    """The effect with what the form of its law leaves open as one more parameter; any other effect as it is."""
-    return type(effect)(rounded=True) if isinstance(effect, DryFriction) else effect
