@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["RunawayError", "Track", "World", "build", "count_substeps", "simulate"]
 
-FINE, LONGEST = 4, 5e-4
+FINE, LONGEST = 4, 2e-3
 """Steps of a world in one of the model's, at least, and s, the longest that they may be, for joints that stick."""
 WILD = 1e3
 """rad/s or m/s at which a machine has run away."""

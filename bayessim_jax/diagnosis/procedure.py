@@ -61,6 +61,9 @@ RACED, PLACES = 40, 2
 """Candidates, and places of each effect, that go on after their first steps along the motion."""
 FINISHED = 14
 """Single effects that are fitted to the end along the motion."""
+STUCK = 2.0
+"""Nats by which an effect with a special case explains less than that one, more than its parameters cost, where it is
+begun from that one's numbers."""
 GLANCED = 4
 """Partners of a leader that are fitted to the end."""
 GLANCING, FIRST_STEPS = 6, 2
@@ -302,7 +305,11 @@ class _Growth:
             glanced = self._glance(known, {s: [end[1:] for end in glanced[s]] for s in going}, GLANCING)
         best = list(glanced)[:GLANCED]
         # a glance may miss what its general case shows
-        best += [s for s in tried if s not in best and any(self._is_special_case(wider[s], wider[b]) for b in best)]
+        best += [
+            s
+            for s in tried
+            if s not in best and any(_is_special_case(self.screens[0], wider[s], wider[b]) for b in best)
+        ]
 
         grown = [(s, known) for s in best]
         split = [(s, first.part(known, kept)) for s, kept in first.scene.apart(known.candidate)]
@@ -331,12 +338,6 @@ class _Growth:
         found = _each(self.screens, list(ends), lambda screen, s: screen.glance(s, known, ends[s], steps))
         finite = [(s, each) for s, each in zip(ends, found, strict=True) if each]
         return dict(sorted(finite, key=lambda item: item[1][0][0]))
-
-    def _is_special_case(self, effect: int, other: int) -> bool:
-        """Whether an effect is a special case of another one at the same joint."""
-        scene = self.screens[0].scene
-        names = (f"{scene.pairs[k][0].name}@{scene.sites[k].joint}" for k in (other, effect))
-        return effect != other and scene.sites[effect].joint >= 0 and contains(*names)
 
 
 def _quiet(text: str) -> None:
@@ -400,7 +401,41 @@ def _rank(
     going = {each.candidate for each in ahead}
     every = ranked([*raced, *(each for each in begun if each.candidate not in going)])
     ended = _each(screens, every[:FINISHED], lambda screen, begun: screen.finish_candidate(begun, nothing))
-    return sorted((e for e in ended if e is not None), key=lambda e: -e.score), every
+    found = _generalize(screens, nothing, [e for e in ended if e is not None])
+    return sorted(found, key=lambda e: -e.score), every
+
+
+def _generalize(screens: Sequence[Screen], nothing: Screened, ended: Sequence[Screened]) -> list[Screened]:
+    """The same, effects that came to less than a special case of theirs begun anew from that one's numbers."""
+
+    def count(each: Screened) -> int:
+        return screens[0].scene.count(each.candidate)
+
+    stuck: dict[int, Screened] = {}
+    for i, each in enumerate(ended):
+        own = each.candidate.effects[0]
+        simpler = [
+            other
+            for other in ended
+            if _is_special_case(screens[0], other.candidate.effects[0], own)
+            and other.score - each.score > max(count(each) - count(other), 0) + STUCK
+        ]
+        if simpler:
+            stuck[i] = max(simpler, key=lambda other: other.score)
+
+    def finish(screen: Screen, i: int) -> Screened | None:
+        begun = screen.begin_from(ended[i].candidate, stuck[i], nothing)
+        return begun and screen.finish_candidate(begun, nothing)
+
+    again = dict(zip(stuck, _each(screens, list(stuck), finish), strict=True))
+    return [max(filter(None, (each, again.get(i))), key=lambda e: e.score) for i, each in enumerate(ended)]
+
+
+def _is_special_case(screen: Screen, effect: int, other: int) -> bool:
+    """Whether an effect is a special case of another one at the same joint."""
+    scene = screen.scene
+    names = (f"{scene.pairs[k][0].name}@{scene.sites[k].joint}" for k in (other, effect))
+    return effect != other and scene.sites[effect].joint >= 0 and contains(*names)
 
 
 def _promising(screen: Screen, ranked: Sequence[int]) -> list[int]:

@@ -206,6 +206,28 @@ class Screen:
         ends = [(p, delta) for p in points for delta in self.scene.states(known.delta)]
         return self._race(candidate, known, ends, RACES[:1])
 
+    def begin_from(self, candidate: Candidate, simpler: Screened, known: Screened) -> Begun | None:
+        """Take all steps before the last ones with an effect from the numbers of a special case of it.
+
+        Parameters of the same unit have its number; the others are where they are begun from.
+        """
+        self.scene.begin_around(known.candidate, known.p)
+        ((k, place),), ((s, held),) = self.offsets(candidate), self.offsets(simpler.candidate)
+        parameters, margin = self.scene.parameters, self.scene.margin
+        numbers = zip(parameters[s], margin[s], simpler.p[held], strict=True)
+        values = {p.unit: float(m.value(float(z))) for p, m, z in numbers}
+        ends = {}
+        for start in self.starts(candidate):
+            p = np.zeros(self.d + self.slots)
+            p[: self.d], p[place] = simpler.p[: self.d], start
+            for i, (parameter, own) in enumerate(zip(parameters[k], margin[k], strict=True)):
+                if parameter.unit in values:
+                    inside = EDGE * (parameter.high - parameter.low)
+                    value = np.clip(values[parameter.unit], parameter.low + inside, parameter.high - inside)
+                    p[place.start + i] = own.standard(float(value))
+            ends[p.tobytes()] = (p, simpler.delta)
+        return self._race(candidate, known, list(ends.values()), RACES)
+
     def resume_candidate(self, begun: Begun, known: Screened) -> Begun | None:
         """Go on with a candidate from the best of those points."""
         self.scene.begin_around(known.candidate, known.p)

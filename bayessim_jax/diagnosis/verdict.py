@@ -39,6 +39,7 @@ CONTAINS = {
     "load_dependent_friction": ("coulomb_friction",),
     "lugre_friction": ("coulomb_friction", "stribeck_friction"),
     "hysteresis": ("coulomb_friction",),
+    "back_emf": ("actuator_gain",),
     "gain_drop": ("actuator_gain",),
     "gain_drift": ("actuator_gain",),
     "joint_flexibility": ("armature",),

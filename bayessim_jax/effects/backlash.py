@@ -24,28 +24,44 @@ class Backlash(ForceEffect):
     λ = μ (x' ∓ g/2)/h² with 1/μ = 1/J + 1/m and x' their distance as it would be without λ; it never pulls. It acts on
     the actuator's side and needs the motion of the joint, so its port is `force` and its place the actuator. Without a
     rotor (J = 0) the motor crosses the gap in no time, and λ = τ_m. g in rad or m, J in kg m² or kg, at the joint.
+
+    Teeth that are `rounded` give way before they mesh, and bounce: at a depth p beyond the gap λ = k p + d ṗ with
+    d = 2 ζ √(k J), both at the end of the time step, which for k → ∞ is the law above. k in N m/rad or N/m.
     """
 
     name = "backlash"
     holds = True
     recalls = True
 
+    def __init__(self, rounded: bool = False) -> None:
+        """With `rounded` stiffness and damping of the teeth are two more parameters; otherwise they are rigid."""
+        self.rounded = rounded
+
     def places(self, model: mujoco.MjModel) -> list[str]:
         """Every actuator of a hinge or slide."""
         return driving_actuators(model)
 
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
-        """The gap g and the rotor's inertia J."""
-        inertia = scales.inertia
+        """The gap g and the rotor's inertia J; k and ζ where they are free."""
+        # a gap is small beside a turn, however far a joint goes round
+        reach = min(scales.position, 1.0) if scales.unit == "rad" else scales.position
+        inertia, k = scales.inertia, scales.force / reach
+        unit = f"{scales.force_unit}/{scales.unit}"
+        teeth = (
+            EffectParameter("stiffness", unit, 10.0 * k, 1e6 * k, 1e6 * k, 1e3 * k, log=True, scan=3, form=0.3),
+            EffectParameter("damping", "", 0.02, 2.0, 1.0, 0.3, log=True, form=0.3),
+        )
         return (
-            EffectParameter("gap", scales.unit, 0.0, 0.5 * scales.position, 0.0, 0.03 * scales.position, form=0.02),
-            EffectParameter("rotor_inertia", scales.inertia_unit, 0.0, inertia, 0.0, 0.1 * inertia),
+            EffectParameter("gap", scales.unit, 0.0, 0.5 * reach, 0.0, 0.03 * reach, form=0.02),
+            EffectParameter("rotor_inertia", scales.inertia_unit, 0.0, inertia, 0.0, 0.1 * inertia, scan=3),
+            *(teeth if self.rounded else ()),
         )
 
     def begin(self, values: Values, moment: Moment) -> Memory:
         """θ and θ̇ of a motor that moves with the joint, at the end of the gap to which it presses."""
         load = _rigid(values, moment)
-        return moment.position + 0.5 * values["gap"] * jnp.sign(load), moment.velocity
+        depth = load / values["stiffness"] if self.rounded else 0.0
+        return moment.position + 0.5 * values["gap"] * jnp.sign(load) + depth, moment.velocity
 
     def recall(self, values: Values, memory: Memory, past: Past, move: Number = 0.0) -> Memory:
         """θ and θ̇ of a motor within a gap that moves as recorded, on cubics between the rows.
@@ -61,6 +77,14 @@ class Backlash(ForceEffect):
             position, velocity, push = now
             angle = angle + step * (speed + 0.5 * step * push)
             speed = speed + step * push
+            if self.rounded:
+                k, d = _teeth(values)
+                x, rate = angle - position, speed - velocity
+                beyond = x - jnp.clip(x, -half, half)
+                slowed = (k * beyond + d * rate) / (rotor + step * (d + step * k))
+                slowed = jnp.where(beyond > 0.0, jnp.maximum(slowed, 0.0), jnp.minimum(slowed, 0.0))
+                slowed = jnp.where(beyond == 0.0, 0.0, slowed)
+                return (angle - step**2 * slowed, speed - step * slowed), None
             above, below = angle >= position + half, angle <= position - half
             speed = jnp.where(above, jnp.minimum(speed, velocity), speed)
             speed = jnp.where(below, jnp.maximum(speed, velocity), speed)
@@ -81,9 +105,24 @@ class Backlash(ForceEffect):
         ahead = (angle - moment.position) + h * (speed - moment.velocity)
         stiff, half = rotor * m / (rotor + m) / h**2, 0.5 * values["gap"]
         load = _rigid(values, moment)
-        meshing = jnp.maximum(stiff * (ahead - half) + load, 0.0) + jnp.minimum(stiff * (ahead + half) + load, 0.0)
+        upper, lower = stiff * (ahead - half) + load, stiff * (ahead + half) + load
+        if self.rounded:
+            k, d = _teeth(values)
+            mu, damped = stiff * h**2, d * (stiff * h**2 * (speed - moment.velocity) + h * load)
+            yielding = mu + h * (d + h * k)
+            upper, lower = (
+                jnp.where(sign * end > 0.0, (k * h**2 * end + damped) / yielding, 0.0)
+                for sign, end in ((1.0, upper), (-1.0, lower))
+            )
+        meshing = jnp.maximum(upper, 0.0) + jnp.minimum(lower, 0.0)
         after = speed + h * (moment.drive - meshing) / jnp.maximum(rotor, 1e-6 * m)
         return meshing - moment.drive, (angle + h * after, after)
+
+
+def _teeth(values: Values) -> tuple[Number, Number]:
+    """K and d."""
+    k = values["stiffness"]
+    return k, 2.0 * values["damping"] * jnp.sqrt(k * jnp.maximum(values["rotor_inertia"], TINY))
 
 
 def _rigid(values: Values, moment: Moment) -> Number:

@@ -7,7 +7,7 @@ import mujoco
 from jaxtyping import Array
 
 from bayessim_jax.effects.contract import EffectParameter, ModelEffect, Number, Numbers, Scales, Values
-from bayessim_jax.engines.contacts import find_partners
+from bayessim_jax.engines.contacts import find_contact, find_partners
 
 __all__ = ["ContactFriction"]
 
@@ -22,7 +22,9 @@ class ContactFriction(ModelEffect):
     name = "contact_friction"
 
     def places(self, model: mujoco.MjModel) -> list[str]:
-        """Every geom with a name that moves and can touch something."""
+        """Every geom with a name that moves and can touch something, unless contacts are disabled."""
+        if find_contact(model) is None:
+            return []
         moving = [g for g in range(model.ngeom) if model.body_weldid[model.geom_bodyid[g]] and model.geom(g).name]
         return [f"geom/{model.geom(g).name}" for g in moving if find_partners(model, g)]
 

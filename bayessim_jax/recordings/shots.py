@@ -22,6 +22,7 @@ from bayessim_jax.inference.shooting import Shots
 from bayessim_jax.recordings.priors import LogNormal, Normal, Prior
 from bayessim_jax.recordings.recording import CaseRecording, resample
 from bayessim_jax.recordings.smoothing import smooth_recordings
+from bayessim_jax.recordings.touching import drop_contacts
 from bayessim_jax.recordings.windows import Windows, stack_windows
 from bayessim_jax.systems.mjcf import MjcfSystem, Unknown, mjcf_system
 
@@ -260,12 +261,15 @@ def _rows(windows: Windows) -> Bool[np.ndarray, "windows rows"]:
     return np.concatenate([first, windows.valid], axis=1)
 
 
-def case_model(case: LoadedCase, *, engine: str = "auto", before: float = 0.0, refined: int = 1) -> CaseModel:
+def case_model(
+    case: LoadedCase, *, engine: str = "auto", before: float = 0.0, refined: int = 1, contacts: bool = False
+) -> CaseModel:
     """Make a case's system, on a time step that its recordings' rows are a whole number of steps apart.
 
     With `refined` the simulation takes so many steps for one of the model's. Recordings whose rows are not evenly
-    spaced, or at another rate than the others, are put on a uniform grid. Raises `ValueError` for what the engine does
-    not take.
+    spaced, or at another rate than the others, are put on a uniform grid. Contacts are left out where the tree engine
+    takes the model without them and nothing touches in the recordings, unless they are asked for. Raises `ValueError`
+    for what the engine does not take.
     """
     restarted = _restarted(case) if case.model is None else None
     dt = restarted.dt if restarted else float(np.median([r.step for r in case.recordings]))
@@ -301,6 +305,8 @@ def case_model(case: LoadedCase, *, engine: str = "auto", before: float = 0.0, r
         if any(getattr(r, mask)[:, i].any() for r in recordings)
     }
     channels = tuple(c for c in (*layout.qpos, *layout.qvel, *layout.sensors) if c in measured)
+    if engine in ("auto", "tree") and not contacts and drop_contacts(spec, case.recordings):
+        remarks.append("contacts are left out: nothing touches in the recordings")
     unknowns = [Unknown(p.name, tuple(str(t) for t in p.targets), *_bounds(p.prior), p.unit) for p in case.parameters]
     system = mjcf_system(spec, unknowns, observe=channels, substeps=substeps, engine=engine)
     return CaseModel(case, system, margins_of(case), tuple(recordings), channels, tuple(remarks), before, refined)

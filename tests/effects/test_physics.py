@@ -234,6 +234,21 @@ def test_backlash_loses_motion_at_a_reversal():
     np.testing.assert_allclose(tight, stiff, atol=5e-3)
 
 
+def test_teeth_that_give_way_ring_as_a_spring_between_two_inertias_and_rigid_ones_mesh():
+    rotor, k, force, rounded = 0.5, 400.0, 2.0, open_form(EFFECTS["backlash"])
+    _, v = ride([(rounded, "actuator/m")], [0.0, rotor, k, 0.02], np.concatenate([push(0.0, 20), push(force, 280)]))
+    t = 0.01 * np.arange(280)
+    rings = v[20:] - np.polyval(np.polyfit(t, v[20:], 1), t)
+    crossings = np.flatnonzero((rings[:60] < 0.0) & (rings[1:61] >= 0.0))
+    period = 2.0 * np.pi * np.sqrt(rotor * MASS / (rotor + MASS) / k)
+    assert 0.01 * np.diff(crossings).mean() == pytest.approx(period, rel=0.1)
+    assert v[-1] - v[-101] == pytest.approx(force / (MASS + rotor), rel=0.01)
+    gap, there = 0.02, np.concatenate([push(force, 100), push(-force, 200)])
+    rigid = ride([("backlash", "actuator/m")], [gap, rotor], there)[1]
+    stiff = ride([(rounded, "actuator/m")], [gap, rotor, 1e7, 1.0], there)[1]
+    np.testing.assert_allclose(stiff, rigid, atol=0.02)
+
+
 def test_armature_is_inertia_of_the_joint_alone():
     _, v = ride([("armature", RAIL)], [3.0], push(5.0, 100))
     assert v[-1] == pytest.approx(5.0 / (MASS + 3.0), rel=1e-9)
