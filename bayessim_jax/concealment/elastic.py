@@ -131,7 +131,7 @@ class Hysteresis(ForceLaw):
 
 @dataclass
 class DisturbanceEvent(ForceLaw):
-    """τ = P π/(2 w) sin(π (t − t₀)/w) for t₀ < t < t₁ = t₀ + w: half a sine that hands over the impulse P.
+    """τ = P π/(2 w) sin(π (t − t₀)/w) for t₀ < t < t₁ = t₀ + w, or P/w: half a sine or a rectangle of the impulse P.
 
     t in s since the beginning of every recording.
     """
@@ -140,20 +140,23 @@ class DisturbanceEvent(ForceLaw):
     start: float
     end: float
     impulse: float
+    rectangle: bool = False
 
     @classmethod
     def make(cls, spot: Spot, amplitude: float, rng: np.random.Generator) -> DisturbanceEvent:
         """A push of 5 to 12 % of the recording's duration, not at its ends."""
         width, start = rng.uniform(0.05, 0.12) * spot.duration, rng.uniform(0.15, 0.7) * spot.duration
         peak = amplitude * spot.force * math.sqrt(2.0 * spot.duration / width)
-        return cls(spot, start, start + width, rng.choice([-1.0, 1.0]) * peak * width * 2.0 / math.pi)
+        impulse = rng.choice([-1.0, 1.0]) * peak * width * 2.0 / math.pi
+        return cls(spot, start, start + width, impulse, bool(rng.uniform() < 0.5))
 
     def force(self, world: World, q: float, v: float) -> float:
         """The push."""
         phase = (world.time - self.start) / (self.end - self.start)
         if not 0.0 < phase < 1.0:
             return 0.0
-        return self.impulse * math.pi / (2.0 * (self.end - self.start)) * math.sin(math.pi * phase)
+        shape = 1.0 if self.rectangle else math.pi / 2.0 * math.sin(math.pi * phase)
+        return self.impulse / (self.end - self.start) * shape
 
 
 @dataclass

@@ -175,8 +175,10 @@ def test_sensors_leave_the_motion_as_it_is():
         assert np.abs(track.shown - clean.shown).max() > 0.05
 
 
-def test_a_push_hands_over_its_impulse():
-    _, law = made("pendulum", "disturbance_event", "joint/hinge", 0.3)
+@pytest.mark.parametrize("rectangle", [False, True])
+def test_a_push_hands_over_its_impulse(rectangle):
+    drawn = [made("pendulum", "disturbance_event", "joint/hinge", 0.3, seed)[1] for seed in range(10)]
+    law = next(law for law in drawn if law.rectangle == rectangle)
 
     class Now:
         time = 0.0
