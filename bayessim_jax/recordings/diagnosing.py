@@ -66,6 +66,8 @@ class CaseDiagnosis:
     flexible: Screened | None
     flexible_bench: Bench | None
     locations: list[Location]
+    forces: dict[str, tuple[np.ndarray, ...]]
+    """The force without a name at every joint, position, velocity and drive there, and the time, along the motion."""
     scores: dict[str, Score]
     """`baseline`, `augmented`, `flexible`, on windows that nothing was fitted to."""
     spreads: dict[str, Float[np.ndarray, "bins obs"]]
@@ -318,6 +320,7 @@ def diagnose_case(
         flexible=residual.found if residual else None,
         flexible_bench=residual.bench if residual else None,
         locations=_locations(taken, result, residual) if named else [],
+        forces=residual.forces if residual else {},
         scores=scores,
         spreads=spreads,
         predictions=predictions,

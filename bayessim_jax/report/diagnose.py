@@ -10,8 +10,11 @@ import numpy as np
 from bayessim_jax.diagnosis.verdict import Thresholds, share_left
 from bayessim_jax.recordings.diagnosing import CaseDiagnosis
 from bayessim_jax.recordings.experiments import advise
+from bayessim_jax.recordings.shots import take
 from bayessim_jax.report import html
+from bayessim_jax.report.laws import laws_plot, state_plot
 from bayessim_jax.report.misfit import candidates_plot, misfit_map
+from bayessim_jax.report.replay import replay_animation
 from bayessim_jax.report.residuals import residual_plot
 from bayessim_jax.report.style import BLUE, ORANGE, PURPLE
 from bayessim_jax.report.timelines import window_traces
@@ -19,6 +22,9 @@ from bayessim_jax.report.viewer import SCRIPT_HASH, script
 from bayessim_jax.report.words import number, plus_minus
 
 __all__ = ["headline", "render"]
+
+BENT = 3.0
+"""Standard deviations by which a parameter differs between simulators, from which it is told."""
 
 
 def headline(diagnosis: CaseDiagnosis) -> str:
@@ -74,6 +80,7 @@ def headline(diagnosis: CaseDiagnosis) -> str:
 def render(diagnosis: CaseDiagnosis, facts: Mapping[str, Any]) -> str:
     """The page."""
     case, result = diagnosis.model.case, diagnosis.result
+    named = result.verdict in ("explained", "ambiguous")
     out = str(facts.get("folder", "RUN"))
     notices = []
     if result.verdict == "no_mismatch" and not result.entries:
@@ -96,14 +103,25 @@ def render(diagnosis: CaseDiagnosis, facts: Mapping[str, Any]) -> str:
         html.section("Recording against prediction", _traces(diagnosis), _scores(diagnosis)),
     ]
     if diagnosis.locations:
-        body.append(html.section("Where it sits", _places(diagnosis), html.figure(*_map(diagnosis), wide=True)))
+        maps = [_map(diagnosis), *([_states(diagnosis)] if diagnosis.forces else [])]
+        body.append(
+            html.section("Where it sits", _places(diagnosis), *(html.figure(*each, wide=True) for each in maps))
+        )
     if result.entries:
         body.append(
             html.section("What was tried", html.figure(*_candidates(diagnosis), wide=True), _entries(diagnosis))
         )
+    if named and (curves := laws_plot(diagnosis)):
+        caption = (
+            "The laws that were found, from 5 % to 95 % of what is believed of their numbers, as far as was recorded; "
+            "friction that grows with the load is shown at half of what usually drives the joint."
+        )
+        body.append(html.section("What it does", html.figure(curves, "The effects as curves.", caption, wide=True)))
+    if case.model is not None and diagnosis.model.case.layout.single:
+        body.append(html.section("Replay", _replay(diagnosis)))
     body += [
         html.section("What the predictions miss", html.figure(*_residuals(diagnosis), wide=True)),
-        html.section("Parameters", _parameters(diagnosis)),
+        html.section("Parameters", *_bent(diagnosis), _parameters(diagnosis)),
         html.section(
             "What to do next",
             html.commands(
@@ -183,6 +201,40 @@ def _map(diagnosis: CaseDiagnosis) -> tuple[str, str, str]:
         "as it is (above), and with the best candidate (below)."
     )
     return svg, "Map of the misfit over windows and channels.", caption
+
+
+def _states(diagnosis: CaseDiagnosis) -> tuple[str, str, str]:
+    scales = diagnosis.bench.scales
+    svg = state_plot(
+        diagnosis.forces, {place: (scales[place].unit, scales[place].force_unit) for place in diagnosis.forces}
+    )
+    caption = "Mean size of the force without a name over the states that were recorded: where in them something acts."
+    return svg, "Map of the force without a name over position and velocity.", caption
+
+
+def _replay(diagnosis: CaseDiagnosis) -> str:
+    """The model moving as recorded, and its ghosts."""
+    held = ~diagnosis.chosen
+    ghosts = [("as it is", ORANGE, diagnosis.predictions["baseline"][held])]
+    if diagnosis.result.verdict in ("explained", "ambiguous"):
+        ghosts.append(("with what was found", BLUE, diagnosis.predictions["augmented"][held]))
+    return replay_animation(diagnosis.model, take(diagnosis.windows, held), ghosts, "by the simulators")
+
+
+def _bent(diagnosis: CaseDiagnosis) -> list[str]:
+    """A warning for every parameter that took the place of what was missing."""
+    if diagnosis.result.verdict not in ("explained", "ambiguous"):
+        return []
+    found = []
+    for name, entry in diagnosis.table()["parameters"].items():
+        before, after = entry["baseline"], entry["augmented"]
+        apart = abs(before["mean"] - after["mean"])
+        if apart > BENT * np.hypot(before["sd"], after["sd"]):
+            off = f"{number(100 * apart / abs(after['mean']), 2)} % " if after["mean"] else ""
+            found.append(
+                html.notice(f"Without what was found, {name} came out {off}off: it had taken part of its place.")
+            )
+    return found
 
 
 def _candidates(diagnosis: CaseDiagnosis) -> tuple[str, str, str]:

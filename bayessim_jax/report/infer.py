@@ -6,22 +6,18 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from bayessim_jax.recordings.identification import CaseInference
 from bayessim_jax.report import html
 from bayessim_jax.report.pairs import pair_plot
+from bayessim_jax.report.replay import replay_animation
 from bayessim_jax.report.residuals import residual_plot
-from bayessim_jax.report.skeleton import draw_positions, plane_of
 from bayessim_jax.report.style import BLUE, ORANGE
 from bayessim_jax.report.timelines import window_traces
-from bayessim_jax.report.viewer import SCRIPT_HASH, animation, script
+from bayessim_jax.report.viewer import SCRIPT_HASH, script
 from bayessim_jax.report.words import number, plus_minus
 
 __all__ = ["headline", "render", "replay_figure", "trace_figure"]
-
-FRAMES = 160
-"""Of a replay."""
 
 
 def headline(result: CaseInference) -> str:
@@ -172,36 +168,8 @@ def trace_figure(result: CaseInference) -> str:
 
 def replay_figure(result: CaseInference) -> str:
     """The model moving as recorded, and its two ghosts."""
-    model = result.model
-    names, wanted = model.channels, model.case.layout.qpos
-    windows = result.held_out
-    first = windows.recording[0]
-    chosen = [w for w in range(len(windows)) if windows.recording[w] == first][:6]
-    rows = [np.concatenate([[True], windows.valid[w]]) for w in chosen]
-    time = np.concatenate([(windows.start[w] + windows.time[w])[r] for w, r in zip(chosen, rows, strict=True)])
-    recorded = np.concatenate([windows.qpos[w][r] for w, r in zip(chosen, rows, strict=True)])
-
-    def ghost(predicted: Float[np.ndarray, "windows rows obs"]) -> np.ndarray:
-        moved = recorded.copy()
-        values = np.concatenate([predicted[w][r] for w, r in zip(chosen, rows, strict=True)])
-        for k, name in enumerate(wanted):
-            if name in names:
-                moved[:, k] = values[:, names.index(name)]
-        return moved
-
-    thin = max(len(time) // FRAMES, 1)
-    motions = [recorded, ghost(result.predictions["baseline"]), ghost(result.predictions["posterior"])]
-    drawn = [draw_positions(model.case.model, motion[::thin]) for motion in motions]
-    axes = list(plane_of(np.concatenate([d.reshape(-1, 3) for d in drawn[:1]])))
-    flat = [d[..., axes].reshape(len(d), -1, 4) for d in drawn]
-    looks = [("recording", "", 0.9, 3.0), ("before", ORANGE, 0.55, 6.0), ("after", BLUE, 0.55, 6.0)]
-    order = (1, 2, 0)
-    bodies = [(*looks[i], flat[i]) for i in order]
-    caption = (
-        f"{model.recordings[first].name}, held out: the model as recorded, and simulated from the same instants before "
-        f"and after the fit, seen along the {'xyz'[3 - sum(axes)]} axis."
-    )
-    return animation(time[::thin], bodies, caption)
+    ghosts = [("before", ORANGE, result.predictions["baseline"]), ("after", BLUE, result.predictions["posterior"])]
+    return replay_animation(result.model, result.held_out, ghosts, "before and after the fit")
 
 
 def _residuals(result: CaseInference) -> tuple[str, str, str]:

@@ -61,6 +61,7 @@ def test_the_run_folder_is_complete_and_the_model_has_the_friction(friction):
     assert model.dof_frictionloss[0] == pytest.approx(wanted, rel=1e-4)
     page = (run / "report.html").read_text()
     assert "Missing is coulomb_friction at joint/hinge" in page
+    assert all(f"<h2>{title}" in page for title in ("Where it sits", "What it does", "Replay"))
 
 
 def test_recordings_given_later_are_scored(friction, folder, capsys):
@@ -174,4 +175,4 @@ def test_the_reports_scripts_run_and_draw(friction, tmp_path):
     page = (friction[0] / "report.html").read_text()
     dom, errors = open_in_chromium(page, tmp_path)
     assert errors == []
-    assert len(re.findall(r"<canvas[^>]* style=.height", dom)) == 1
+    assert len(re.findall(r"<canvas[^>]* style=.height", dom)) == 2  # traces and replay

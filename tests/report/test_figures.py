@@ -1,11 +1,14 @@
 import re
 import xml.etree.ElementTree as ET
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from bayessim_jax.effects import EFFECTS, Scales
 from bayessim_jax.report.curves import estimates_plot, log_density_plot, return_plot
 from bayessim_jax.report.density import credible_levels, density1d, density2d
+from bayessim_jax.report.laws import DRAWS, _curves, state_plot
 from bayessim_jax.report.pairs import pair_plot
 from bayessim_jax.report.trust import coverage_plot, rank_plot, truth_coverage_plot
 
@@ -15,6 +18,20 @@ NAN = np.full((1, 4), np.nan)
 
 def words(svg):
     return [e.text.strip() for e in ET.fromstring(svg).iter() if e.tag.endswith("}text") and e.text]
+
+
+def test_a_law_is_shown_as_it_is_and_where_its_numbers_put_it():
+    scales = Scales(force=2.0, speed=3.0, inertia=0.1)
+    bench = SimpleNamespace(pairs=[(EFFECTS["coulomb_friction"], "joint/a")], scales={"joint/a": scales})
+    x, levels = np.array([-3.0, -0.1, 0.1, 3.0]), np.linspace(0.2, 0.4, DRAWS + 1)[:, None]
+    curves = _curves(SimpleNamespace(bench=bench), 0, {"coulomb": levels}, x)
+    np.testing.assert_allclose(curves, -levels * np.sign(x))
+
+
+def test_a_map_of_forces_over_states_names_joints_and_units():
+    forces = {"joint/a": tuple(RNG.normal(size=(5, 400)))}
+    shown = words(state_plot(forces, {"joint/a": ("rad", "N m")}))
+    assert {"joint/a", "position [rad]", "velocity [rad/s]", "force [N m]"} <= set(shown)
 
 
 def test_a_density_holds_all_mass_at_a_bound_and_peaks_where_the_law_does():
