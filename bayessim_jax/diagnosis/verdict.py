@@ -38,7 +38,7 @@ CONTAINS = {
     "asymmetric_friction": ("coulomb_friction",),
     "load_dependent_friction": ("coulomb_friction",),
     "lugre_friction": ("coulomb_friction", "stribeck_friction"),
-    "hysteresis": ("coulomb_friction",),
+    "hysteresis": ("coulomb_friction", "joint_spring"),
     "back_emf": ("actuator_gain",),
     "gain_drop": ("actuator_gain",),
     "gain_drift": ("actuator_gain",),
