@@ -71,8 +71,8 @@ def simulator_of(model: CaseModel, state: dict[str, Any], name: str) -> tuple[An
     """
     entry = state["simulators"][name]
     scales = {place: Scales(**table) for place, table in state["scales"].items()}
-    pairs = []
-    for (name, place), rounded in zip(entry["effects"], entry["rounded"], strict=True):
+    pairs, sharp = [], [False] * len(entry["effects"])
+    for (name, place), rounded in zip(entry["effects"], entry.get("rounded", sharp), strict=True):
         effect = FLEXIBLE if name == FLEXIBLE.name else lookup_effect(name)
         pairs.append((open_form(effect) if rounded else effect, place))
     plain: Any = model.system
