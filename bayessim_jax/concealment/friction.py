@@ -65,8 +65,19 @@ class QuadraticDrag(ForceLaw):
         return -self.coefficient * v * math.hypot(v, 0.02 * self.spot.speed)
 
 
+class DryFriction(ForceLaw):
+    """What holds a joint: stiff bristles, or a sign that is rounded."""
+
+    rounding: float
+    """ε, rad/s or m/s; 0 with bristles."""
+
+    def begin(self, world: World, rng: np.random.Generator) -> None:
+        """With bristles that are not bent."""
+        self._grip = grip(self.spot, self.rounding)
+
+
 @dataclass
-class CoulombFriction(ForceLaw):
+class CoulombFriction(DryFriction):
     """τ = −F_c sign(v), at rest what holds the joint: a stiff bristle that slips at F_c; or −F_c tanh(v/ε)."""
 
     name = "coulomb_friction"
@@ -79,17 +90,13 @@ class CoulombFriction(ForceLaw):
         level = amplitude * spot.force
         return cls(spot, level, draw_rounding(spot, level, rng))
 
-    def begin(self, world: World, rng: np.random.Generator) -> None:
-        """With bristles that are not bent."""
-        self._grip = grip(self.spot, self.rounding)
-
     def force(self, world: World, q: float, v: float) -> float:
         """The bristles', or that of a rounded sign."""
         return self._grip.pull(v, self.coulomb, self.coulomb)
 
 
 @dataclass
-class StribeckFriction(ForceLaw):
+class StribeckFriction(DryFriction):
     """A stiff bristle that slips at g(v) = F_c + (F_s − F_c)/(1 + (v/v_s)²), or −g(v) tanh(v/ε)."""
 
     name = "stribeck_friction"
@@ -105,10 +112,6 @@ class StribeckFriction(ForceLaw):
         static, velocity = rng.uniform(1.6, 2.2) * coulomb, rng.uniform(0.08, 0.15) * spot.speed
         return cls(spot, coulomb, static, velocity, min(draw_rounding(spot, static, rng), SHARP * velocity))
 
-    def begin(self, world: World, rng: np.random.Generator) -> None:
-        """With bristles that are not bent."""
-        self._grip = grip(self.spot, self.rounding)
-
     def force(self, world: World, q: float, v: float) -> float:
         """The bristles', or that of a rounded sign."""
         level = self.coulomb + (self.static - self.coulomb) / (1.0 + (v / self.velocity) ** 2)
@@ -116,7 +119,7 @@ class StribeckFriction(ForceLaw):
 
 
 @dataclass
-class AsymmetricFriction(ForceLaw):
+class AsymmetricFriction(DryFriction):
     """A stiff bristle that slips at F₊ where v > 0 and at F₋ where v < 0, or −F± tanh(v/ε)."""
 
     name = "asymmetric_friction"
@@ -132,17 +135,13 @@ class AsymmetricFriction(ForceLaw):
         levels = (large, small) if rng.uniform() < 0.5 else (small, large)
         return cls(spot, *levels, draw_rounding(spot, large, rng))
 
-    def begin(self, world: World, rng: np.random.Generator) -> None:
-        """With bristles that are not bent."""
-        self._grip = grip(self.spot, self.rounding)
-
     def force(self, world: World, q: float, v: float) -> float:
         """The bristles', or that of a rounded sign."""
         return self._grip.pull(v, self.negative, self.positive)
 
 
 @dataclass
-class LoadDependentFriction(ForceLaw):
+class LoadDependentFriction(DryFriction):
     """A stiff bristle that slips at F_c + K √(τ² + ε²), τ what the motors exert: ε 1 % of the joint's force.
 
     Or that level times −tanh(v/ε_v).
@@ -163,10 +162,6 @@ class LoadDependentFriction(ForceLaw):
         """K, and F_c 15 to 40 % of K times the joint's force."""
         level = rng.uniform(0.15, 0.4) * amplitude * spot.force
         return cls(spot, level, amplitude, draw_rounding(spot, amplitude * spot.force, rng))
-
-    def begin(self, world: World, rng: np.random.Generator) -> None:
-        """With bristles that are not bent."""
-        self._grip = grip(self.spot, self.rounding)
 
     def force(self, world: World, q: float, v: float) -> float:
         """The bristles', or that of a rounded sign."""

@@ -168,6 +168,11 @@ class Diagnosis:
     taken_back: Entry | None = None
     """An answer that was taken back, since it predicts recordings left out too badly."""
 
+    @property
+    def names_something(self) -> bool:
+        """Whether the verdict gives one answer or several."""
+        return self.verdict in ("explained", "ambiguous")
+
     def take_back(self) -> None:
         """Leave the misfit unexplained by what had been found."""
         self.verdict, self.taken_back, self.confusion, self.probabilities = "unexplained", self.best, [], []

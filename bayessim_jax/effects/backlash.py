@@ -8,6 +8,7 @@ import mujoco
 from jaxtyping import Array
 
 from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Past, Scales, Values
+from bayessim_jax.effects.open_form import OpenForm
 from bayessim_jax.effects.places import driving_actuators
 
 __all__ = ["Backlash"]
@@ -17,7 +18,7 @@ PARTS = 8
 TINY = 1e-12
 
 
-class Backlash(ForceEffect):
+class Backlash(OpenForm, ForceEffect):
     """J θ̈ = τ_m − λ, |θ − q| ≤ g/2: the motor turns freely within the gap, and meshes without bouncing at its ends.
 
     The joint feels λ in place of the motor's τ_m. λ is what brings the two to the end of the gap within the time step,
@@ -32,10 +33,6 @@ class Backlash(ForceEffect):
     name = "backlash"
     holds = True
     recalls = True
-
-    def __init__(self, rounded: bool = False) -> None:
-        """With `rounded` stiffness and damping of the teeth are two more parameters; otherwise they are rigid."""
-        self.rounded = rounded
 
     def places(self, model: mujoco.MjModel) -> list[str]:
         """Every actuator of a hinge or slide."""
@@ -120,7 +117,7 @@ class Backlash(ForceEffect):
 
 
 def _teeth(values: Values) -> tuple[Number, Number]:
-    """K and d."""
+    """Stiffness k and damping d."""
     k = values["stiffness"]
     return k, 2.0 * values["damping"] * jnp.sqrt(k * jnp.maximum(values["rotor_inertia"], TINY))
 

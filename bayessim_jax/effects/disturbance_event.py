@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mujoco
 
 from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Scales, Values
+from bayessim_jax.effects.open_form import OpenForm
 from bayessim_jax.effects.places import joints
 
 __all__ = ["DisturbanceEvent"]
@@ -15,7 +16,7 @@ __all__ = ["DisturbanceEvent"]
 TAPER = "taper"
 
 
-class DisturbanceEvent(ForceEffect):
+class DisturbanceEvent(OpenForm, ForceEffect):
     """τ = (2 P/w) sin²(π (t − t₀)/w) for t₀ < t < t₁, w = t₁ − t₀: a bump that hands over the impulse P.
 
     The shape of the push is unknown; a bump without corners stands for it. One that is `rounded` is constant but for
@@ -26,10 +27,6 @@ class DisturbanceEvent(ForceEffect):
     """
 
     name = "disturbance_event"
-
-    def __init__(self, rounded: bool = False) -> None:
-        """With `rounded` the taper is one more parameter; otherwise it is 1."""
-        self.rounded = rounded
 
     def places(self, model: mujoco.MjModel) -> list[str]:
         """Every hinge and slide."""

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mujoco
 
 from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Moment, Number, Scales, Values
+from bayessim_jax.effects.open_form import OpenForm
 from bayessim_jax.effects.places import joints
 
 __all__ = ["DryFriction"]
@@ -15,7 +16,7 @@ __all__ = ["DryFriction"]
 ONSET = "onset"
 
 
-class DryFriction(ForceEffect):
+class DryFriction(OpenForm, ForceEffect):
     """τ = −F s(v/v₀), s the sign, of a law that is `rounded` a straight line below its onset v₀, in rad/s or m/s.
 
     Machines are not as sharp as a sign: lubricants, bearings in series and the models of others let friction rise over
@@ -28,10 +29,6 @@ class DryFriction(ForceEffect):
     """
 
     holds = True
-
-    def __init__(self, rounded: bool = False) -> None:
-        """With `rounded` the onset is one more parameter; otherwise it is 0."""
-        self.rounded = rounded
 
     def places(self, model: mujoco.MjModel) -> list[str]:
         """Every hinge and slide."""

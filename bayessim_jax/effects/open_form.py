@@ -1,14 +1,18 @@
-"""Laws whose form is not known: what it leaves open becomes a parameter that is fitted with the others."""
+"""Laws whose form is not known: what it leaves open becomes parameters that are fitted with the others."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from bayessim_jax.effects.backlash import Backlash
-from bayessim_jax.effects.disturbance_event import DisturbanceEvent
-from bayessim_jax.effects.dry_friction import DryFriction
+__all__ = ["OpenForm", "open_form"]
 
-__all__ = ["open_form"]
+
+class OpenForm:
+    """Beside a contract: an effect with more parameters where it is `rounded`."""
+
+    def __init__(self, rounded: bool = False) -> None:
+        """With `rounded` what its form leaves open is free; otherwise its law is the sharp one."""
+        self.rounded = rounded
 
 
 def open_form(effect: Any) -> Any:
@@ -17,4 +21,4 @@ def open_form(effect: Any) -> Any:
     These are the `onset` of dry friction, below which its sign is rounded; the `taper` of an event, the share of a push
     in which it rises and falls; `stiffness` and `damping` of the teeth between which there is backlash.
     """
-    return type(effect)(rounded=True) if isinstance(effect, (Backlash, DisturbanceEvent, DryFriction)) else effect
+    return type(effect)(rounded=True) if isinstance(effect, OpenForm) else effect

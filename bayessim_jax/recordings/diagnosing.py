@@ -94,7 +94,7 @@ class CaseDiagnosis:
     def table(self) -> dict[str, Any]:
         """What `diagnosis.json` holds."""
         result, best = self.result, self.result.best
-        named = result.verdict in ("explained", "ambiguous")
+        named = result.names_something
         augmented = "augmented" if named else "baseline"
         return {
             "schema": 1,
@@ -303,9 +303,10 @@ def diagnose_case(
         spreads[which] = error_spread(compare(predicted[chosen], y[chosen], measured[chosen]), scale)
         judging[which] = compare(predicted[~chosen], y[~chosen], measured[~chosen])
         scores[which] = score(judging[which], spreads[which], scale, bench.channels)
-    floor = _floor(bench, result.best, scale, model, shots)
+    variance = _variance(bench, result.best, model, shots)
+    floor = _floor(variance, scale, shots)
     if result.confusion:
-        excused = _floor(bench, result.best, scale, model, shots, _beside(model, shots))
+        excused = _floor(variance + np.square(_beside(model, shots)), scale, shots)
         if _is_refuted(judging, scores, excused, scale, thresholds or Thresholds()):
             result.take_back()
     named = result.verdict != "no_mismatch"
@@ -361,22 +362,16 @@ def _beside(model: CaseModel, shots: Shots) -> Float[np.ndarray, "windows rows o
     return 0.0 if error is None else interpolate(error.nodes, error.ratio, error.runs(shots, model.refined))
 
 
-def _floor(
-    bench: Bench,
-    entry: Entry,
-    scale: np.ndarray,
-    model: CaseModel,
-    shots: Shots,
-    beside: Float[np.ndarray, "windows rows obs"] | float = 0.0,
-) -> float:
-    """The nrmse that noise leaves to the best model: of the sensors, and of the recorded initial states, propagated.
-
-    Predictions may be off by what stands `beside`, too.
-    """
+def _variance(bench: Bench, entry: Entry, model: CaseModel, shots: Shots) -> Float[np.ndarray, "windows rows obs"]:
+    """That of predictions of the best model: of the sensors, and of the recorded initial states, propagated."""
     noise = entry.misfit.noise
     start = start_spread(model, dataclasses.replace(entry.fit, sigma=jnp.asarray(noise)))
     here = bench.replay(entry.candidate, entry.fit.z, shots)
-    variance = noise**2 + bench.scatter(entry.candidate, entry.fit.z, shots, start, here) + np.square(beside)
+    return noise**2 + bench.scatter(entry.candidate, entry.fit.z, shots, start, here)
+
+
+def _floor(variance: Float[np.ndarray, "windows rows obs"], scale: np.ndarray, shots: Shots) -> float:
+    """The nrmse of predictions with this variance."""
     mask = np.asarray(shots.measured) & np.isfinite(variance)
     mask[:, 0] = False
     counts = mask.sum((0, 1))

@@ -79,8 +79,7 @@ def headline(diagnosis: CaseDiagnosis) -> str:
 
 def render(diagnosis: CaseDiagnosis, facts: Mapping[str, Any]) -> str:
     """The page."""
-    case, result = diagnosis.model.case, diagnosis.result
-    named = result.verdict in ("explained", "ambiguous")
+    case, result, table = diagnosis.model.case, diagnosis.result, diagnosis.table()
     out = str(facts.get("folder", "RUN"))
     notices = []
     if result.verdict == "no_mismatch" and not result.entries:
@@ -99,7 +98,7 @@ def render(diagnosis: CaseDiagnosis, facts: Mapping[str, Any]) -> str:
         f"<h1>{html.escape(case.case.name)}</h1>",
         f'<p class="lead">{html.escape(headline(diagnosis))}</p>',
         *notices,
-        _absorbed(diagnosis),
+        _absorbed(diagnosis, table),
         html.section("Recording against prediction", _traces(diagnosis), _scores(diagnosis)),
     ]
     if diagnosis.locations:
@@ -111,7 +110,7 @@ def render(diagnosis: CaseDiagnosis, facts: Mapping[str, Any]) -> str:
         body.append(
             html.section("What was tried", html.figure(*_candidates(diagnosis), wide=True), _entries(diagnosis))
         )
-    if named and (curves := laws_plot(diagnosis)):
+    if result.names_something and (curves := laws_plot(diagnosis)):
         caption = (
             "The laws that were found, from 5 % to 95 % of what is believed of their numbers, as far as was recorded; "
             "friction that grows with the load is shown at half of what usually drives the joint."
@@ -121,7 +120,7 @@ def render(diagnosis: CaseDiagnosis, facts: Mapping[str, Any]) -> str:
         body.append(html.section("Replay", _replay(diagnosis)))
     body += [
         html.section("What the predictions miss", html.figure(*_residuals(diagnosis), wide=True)),
-        html.section("Parameters", *_bent(diagnosis), _parameters(diagnosis)),
+        html.section("Parameters", *_bent(diagnosis, table), _parameters(table)),
         html.section(
             "What to do next",
             html.commands(
@@ -140,9 +139,9 @@ def render(diagnosis: CaseDiagnosis, facts: Mapping[str, Any]) -> str:
     return html.page(title, "\n".join(body), script=script(), script_hash=SCRIPT_HASH)
 
 
-def _absorbed(diagnosis: CaseDiagnosis) -> str:
+def _absorbed(diagnosis: CaseDiagnosis, table: Mapping[str, Any]) -> str:
     """What is not there to be found; empty where nothing is known to be."""
-    names = diagnosis.table()["absorbed"]
+    names = table["absorbed"]
     if not names:
         return ""
     unknowns = ", ".join(diagnosis.model.margins.names)
@@ -154,7 +153,7 @@ def _series(diagnosis: CaseDiagnosis) -> list[dict[str, Any]]:
     series = [{"key": "baseline", "label": "the simulator, fitted", "colour": ORANGE, "scale": True}]
     if "flexible" in diagnosis.predictions:
         series.append({"key": "flexible", "label": "with a force without a name", "colour": PURPLE, "width": 1.0})
-    if diagnosis.result.verdict in ("explained", "ambiguous"):
+    if diagnosis.result.names_something:
         series.append({"key": "augmented", "label": "with what was found", "colour": BLUE, "scale": True})
     return [*series, {"key": "measured", "label": "recording", "dots": True, "scale": True}]
 
@@ -171,7 +170,7 @@ def _traces(diagnosis: CaseDiagnosis) -> str:
 
 
 def _scores(diagnosis: CaseDiagnosis) -> str:
-    shown = ["baseline", *(["augmented"] if diagnosis.result.verdict in ("explained", "ambiguous") else [])]
+    shown = ["baseline", *(["augmented"] if diagnosis.result.names_something else [])]
     shown += ["flexible"] if "flexible" in diagnosis.scores else []
     labels = {"baseline": "the simulator, fitted", "augmented": "with what was found", "flexible": "flexible force"}
     rows = [
@@ -216,17 +215,17 @@ def _replay(diagnosis: CaseDiagnosis) -> str:
     """The model moving as recorded, and its ghosts."""
     held = ~diagnosis.chosen
     ghosts = [("as it is", ORANGE, diagnosis.predictions["baseline"][held])]
-    if diagnosis.result.verdict in ("explained", "ambiguous"):
+    if diagnosis.result.names_something:
         ghosts.append(("with what was found", BLUE, diagnosis.predictions["augmented"][held]))
     return replay_animation(diagnosis.model, take(diagnosis.windows, held), ghosts, "by the simulators")
 
 
-def _bent(diagnosis: CaseDiagnosis) -> list[str]:
+def _bent(diagnosis: CaseDiagnosis, table: Mapping[str, Any]) -> list[str]:
     """A warning for every parameter that took the place of what was missing."""
-    if diagnosis.result.verdict not in ("explained", "ambiguous"):
+    if not diagnosis.result.names_something:
         return []
     found = []
-    for name, entry in diagnosis.table()["parameters"].items():
+    for name, entry in table["parameters"].items():
         before, after = entry["baseline"], entry["augmented"]
         apart = abs(before["mean"] - after["mean"])
         if apart > BENT * np.hypot(before["sd"], after["sd"]):
@@ -257,7 +256,7 @@ def _entries(diagnosis: CaseDiagnosis) -> str:
 def _residuals(diagnosis: CaseDiagnosis) -> tuple[str, str, str]:
     held = ~diagnosis.chosen
     y, measured = np.asarray(diagnosis.shots.y)[held], np.asarray(diagnosis.shots.measured)[held]
-    shown = ["baseline", *(["augmented"] if diagnosis.result.verdict in ("explained", "ambiguous") else [])]
+    shown = ["baseline", *(["augmented"] if diagnosis.result.names_something else [])]
     errors = {name: np.where(measured, y - diagnosis.predictions[name][held], np.nan) for name in shown}
     noise = diagnosis.result.best.misfit.noise
     svg = residual_plot(diagnosis.windows.time[held], y, errors, diagnosis.model.channels, noise)
@@ -268,9 +267,8 @@ def _residuals(diagnosis: CaseDiagnosis) -> tuple[str, str, str]:
     return svg, "Residuals against lead time and against the state.", caption
 
 
-def _parameters(diagnosis: CaseDiagnosis) -> str:
+def _parameters(table: Mapping[str, Any]) -> str:
     rows = []
-    table = diagnosis.table()
     for name, entry in table["parameters"].items():
         before, after = entry["baseline"], entry["augmented"]
         shown = [plus_minus(before["mean"], before["sd"]), plus_minus(after["mean"], after["sd"])]

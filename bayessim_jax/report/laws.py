@@ -15,6 +15,7 @@ from bayessim_jax.report.style import BLUE, GREY, draw_svg
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from bayessim_jax.recordings.diagnosing import CaseDiagnosis
@@ -39,6 +40,8 @@ OVER = {
 }
 """What the effects without a memory are curves over."""
 POINTS, DRAWS, BINS = 201, 200, 24
+COLUMNS = 3
+"""Axes side by side."""
 INSTANT = 1e-4
 """s: a time step in which what holds a joint acts with its level at every speed that is shown."""
 
@@ -52,7 +55,7 @@ def laws_plot(diagnosis: CaseDiagnosis) -> str:
     draws = _draw(diagnosis)
 
     def draw(figure: Figure) -> None:
-        for ax, k in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
+        for ax, k in zip(_grid(figure, len(shown)), shown, strict=True):
             effect, place = bench.pairs[k]
             x, unit = _axis(diagnosis, k)
             curves = _curves(diagnosis, k, {name: values[:, None] for name, values in draws[k].items()}, x)
@@ -67,7 +70,7 @@ def laws_plot(diagnosis: CaseDiagnosis) -> str:
             ax.set_ylabel("what arrives" if through else f"force [{bench.scales[place].force_unit}]")
             ax.set_title(f"{effect.name}\n{place}")
 
-    return draw_svg(4.2 * len(shown), 3.2, draw, "laws")
+    return draw_svg(*_size(len(shown)), draw, "laws")
 
 
 def _draw(diagnosis: CaseDiagnosis) -> dict[int, dict[str, Float[np.ndarray, " draws"]]]:
@@ -130,7 +133,7 @@ def state_plot(forces: Mapping[str, tuple[np.ndarray, ...]], units: Mapping[str,
 
     def draw(figure: Figure) -> None:
         for ax, (place, (force, position, velocity, *_)) in zip(
-            figure.subplots(1, len(forces), squeeze=False)[0], forces.items(), strict=True
+            _grid(figure, len(forces)), forces.items(), strict=True
         ):
             known = np.isfinite(force) & np.isfinite(position) & np.isfinite(velocity)
             columns = position[known], velocity[known]
@@ -145,4 +148,15 @@ def state_plot(forces: Mapping[str, tuple[np.ndarray, ...]], units: Mapping[str,
             ax.set_ylabel(f"velocity [{unit}/s]")
             ax.set_title(place)
 
-    return draw_svg(4.2 * len(forces), 3.2, draw, "state")
+    return draw_svg(*_size(len(forces)), draw, "state")
+
+
+def _size(count: int) -> tuple[float, float]:
+    """Inches of a figure with so many axes."""
+    return 4.2 * min(count, COLUMNS), 3.2 * -(-count // COLUMNS)
+
+
+def _grid(figure: Figure, count: int) -> list[Axes]:
+    """So many axes of a figure, row by row."""
+    columns = min(count, COLUMNS)
+    return [figure.add_subplot(-(-count // columns), columns, k + 1) for k in range(count)]

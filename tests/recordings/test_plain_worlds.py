@@ -9,6 +9,7 @@ from bayessim_jax.recordings.diagnosing import diagnose_case
 from bayessim_jax.recordings.evaluation import BEFORE
 from bayessim_jax.recordings.loading import load_case
 from bayessim_jax.recordings.shots import case_model
+from tests.recordings.made_up_case import CASE, write_case
 
 STEP, RATE, SECONDS, RECORDINGS = 2e-4, 100, 4.0, 6
 MODEL = """
@@ -18,20 +19,8 @@ MODEL = """
 <geom name="stick" type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass="0.6"/></body></worldbody>
 <actuator><motor name="motor" joint="hinge" gear="2" ctrlrange="-1 1" ctrllimited="true"/></actuator></mujoco>
 """
-CASE = """
-schema = 1
-name = "plain"
-model = "model.xml"
-recordings = "recordings/*.csv"
-horizon = 0.5
-
-[[parameters]]
-name = "rod_mass"
-unit = "kg"
-targets = ["body/rod/mass"]
-prior = { distribution = "uniform", low = 0.3, high = 1.2 }
-"""
-COLUMNS = "time,joint/hinge/qpos,joint/hinge/qvel,actuator/motor/ctrl"
+HEAVIER = CASE.replace("bob", "rod").replace("low = 0.15, high = 0.6", "low = 0.3, high = 1.2")
+COLUMNS = ("time", "joint/hinge/qpos", "joint/hinge/qvel", "actuator/motor/ctrl")
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -99,9 +88,7 @@ def write_world(folder, law=None, motor=None, seed=0):
     model.opt.timestep = STEP
     model.body_mass[1] *= 1.2
     model.body_inertia[1] *= 1.2
-    (folder / "recordings").mkdir(parents=True)
-    (folder / "model.xml").write_text(MODEL)
-    (folder / "case.toml").write_text(CASE)
+    recordings = {}
     hold, data = round(1.0 / RATE / STEP), mujoco.MjData(model)
     for k in range(RECORDINGS):
         time = np.arange(round(SECONDS * RATE)) / RATE
@@ -122,9 +109,8 @@ def write_world(folder, law=None, motor=None, seed=0):
             mujoco.mj_step(model, data)
         q, v = np.array(rows).T
         seen = [time, q + 1e-3 * rng.normal(size=len(q)), v + 1e-2 * rng.normal(size=len(v)), ctrl]
-        file = folder / "recordings" / f"{k}.csv"
-        np.savetxt(file, np.column_stack(seen), delimiter=",", header=COLUMNS, comments="", fmt="%.9g")
-    return folder
+        recordings[f"run{k + 1}"] = dict(zip(COLUMNS, seen, strict=True))
+    return write_case(folder, HEAVIER, MODEL, **recordings)
 
 
 @pytest.mark.slow
