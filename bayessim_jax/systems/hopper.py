@@ -23,10 +23,12 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from bayessim_jax.contracts import Box, Discrete, Scalar
+from bayessim_jax.systems import converged
 
 __all__ = ["PIPELINES", "Hop", "Hopper", "HopperState"]
 
-PIPELINES = ("generalized", "positional", "spring")
+PIPELINES = ("converged", "generalized", "positional", "spring")
+"""Ours first, then Brax's as they come."""
 SUBSTEPS = 4
 SCATTER = 5e-3
 """Episodes begin with every position and velocity moved by up to this, m and rad, and per s."""
@@ -45,7 +47,8 @@ class Hopper:
 
     MuJoCo takes the larger friction of two geoms that touch, and so does Brax: θ is that of foot and floor. What is
     seen is what the environment shows: height and pitch of the torso, three angles, and the rates of all, clipped to
-    ±10, with the speed along x as the first rate. `pipeline` says which of Brax's ways to step steps it.
+    ±10, with the speed along x as the first rate. `pipeline` says what steps it: `converged` is Brax's generalized
+    dynamics with the forces of contacts and stops solved to the end, the others are Brax's own.
 
     Source: Freeman et al. 2021
     """
@@ -59,7 +62,7 @@ class Hopper:
 
     @classmethod
     def create(
-        cls, friction: tuple[float, float] = (0.1, 0.5), noise: float = 0.01, pipeline: str = "generalized"
+        cls, friction: tuple[float, float] = (0.1, 0.5), noise: float = 0.01, pipeline: str = PIPELINES[0]
     ) -> Hopper:
         """The paper's prior range, and sensor noise of the given standard deviation on every channel."""
         if pipeline not in PIPELINES:
@@ -148,7 +151,9 @@ def _load() -> Any:
         raise ValueError("Hopper needs Brax: pip install 'bayessim-jax[brax]' and try again.")
     with _quiet(), jax.ensure_compile_time_eval():
         mjcf: Any = importlib.import_module("brax.io.mjcf")
-        return mjcf.load(str(Path(found.origin).parent / "envs" / "assets" / "hopper.xml"))
+        model = mjcf.load(str(Path(found.origin).parent / "envs" / "assets" / "hopper.xml"))
+        # MuJoCo's contacts act within a margin, Brax's where geoms overlap
+        return model.replace(geom_pos=jnp.asarray(model.geom_pos).at[0, 2].add(float(model.mj_model.geom_margin[0])))
 
 
 @contextlib.contextmanager
@@ -168,7 +173,7 @@ def _load_rise() -> float:
 @cache
 def _pipeline(name: str) -> Any:
     with _quiet():
-        return importlib.import_module(f"brax.{name}.pipeline")
+        return converged if name == "converged" else importlib.import_module(f"brax.{name}.pipeline")
 
 
 def _with(theta: Any) -> Any:

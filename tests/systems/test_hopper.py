@@ -12,9 +12,10 @@ import pytest
 
 from bayessim_jax.engines.gymnasium import GYMNASIUM
 from bayessim_jax.systems import Hop, Hopper, hopper
+from bayessim_jax.systems.converged import solve_complementarity
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
-from hopper_gap import compare, record
+from hopper_gap import RATIOS, compare, follow, record
 
 
 def test_in_the_air_one_step_is_gymnasiums():
@@ -46,11 +47,34 @@ def test_in_the_air_one_step_is_gymnasiums():
 
 
 def test_the_gap_between_the_engines_is_as_stated():
-    gaps, rewards, same_end = compare(Hopper.create(noise=0.0), *record(20, 5, 0))
-    assert np.median(gaps[:, 0, :5], 0).max() < 3e-3
-    assert np.median(gaps[:, 0, 5:], 0).max() < 3e-2
-    assert np.median(rewards) < 0.03
+    gaps, rewards, same_end = compare(Hopper.create(noise=0.0), *record(30, 15, 0))
+    assert np.median(gaps[:, 0, :5], 0).max() < 2e-3
+    assert np.median(gaps[:, 0, 5:], 0).max() < 1e-2
+    assert np.median(gaps[:, 14, 5:], 0).max() < 0.06
+    assert np.median(rewards) < 0.02
     assert same_end.mean() > 0.9
+
+
+def test_friction_that_follows_the_environment_is_the_environments():
+    """With Brax's own solver a sliding foot needs more than half as much again."""
+    errors = follow(Hopper.create(noise=0.0), *record(30, 15, 0, speed=1.0))
+    assert 0.9 < RATIOS[errors.sum(0).argmin()] < 1.1
+
+
+def test_forces_are_complementary():
+    """Against the conditions themselves, for contacts that press, slide and part, and one that is not there."""
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        jacobian = rng.normal(size=(8, 5))
+        a = jacobian @ jacobian.T + 0.3 * np.eye(8)
+        b = rng.normal(size=8)
+        a[3], a[:, 3], b[3] = 0.0, 0.0, 0.0
+        f = np.asarray(solve_complementarity(jnp.asarray(a), jnp.asarray(b), sweeps=300))
+        slack = a @ f + b
+        assert f.min() >= 0.0
+        assert f[3] == 0.0
+        assert slack.min() > -1e-4
+        np.testing.assert_allclose(f * slack, 0.0, atol=1e-4)
 
 
 def test_friction_stops_a_sliding_foot():
@@ -81,5 +105,5 @@ def test_without_brax_one_line_tells(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"pip install 'bayessim-jax\[brax\]'"):
         Hopper.create()
-    with pytest.raises(ValueError, match="choose one of generalized, positional, spring"):
+    with pytest.raises(ValueError, match="choose one of converged, generalized, positional, spring"):
         Hopper.create(pipeline="planar")
