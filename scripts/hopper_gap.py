@@ -3,8 +3,8 @@
     python scripts/hopper_gap.py --episodes 40
 
 Both start from the environment's own states and take the same random actions: the median difference of what is seen
-after so many control periods without being set right, in the worst channel. Then the friction that Brax's hopper needs to
-follow the environment's while its foot slides, as a ratio to the true one: what an inference through it would be off by.
+after so many control periods without being set right, in the worst channel. Then the friction that Brax's hopper needs
+to follow the environment's while its foot slides, over the true one: what an inference through it would be off by.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def follow(system: Hopper, states: np.ndarray, actions: np.ndarray, thetas: np.n
         def one(ratio: Any) -> Any:
             def step(state: Any, x: Any) -> Any:
                 after = system.step(ratio * theta, state, x[0])
-                return after, jnp.sum((after.physics.qd - x[1][6:]) ** 2)
+                return after, jnp.sum((after.qvel - x[1][6:]) ** 2)
 
             begun = system.begin(ratio * theta, states[0, :6], states[0, 6:])
             return jax.lax.scan(step, begun, (actions, states[1:]))[1].sum()
@@ -144,7 +144,7 @@ def count_steps(system: Hopper) -> float:
             return jax.vmap(system.step)(thetas, states, actions), None
 
         begun = jax.vmap(system.reset)(jax.random.split(key, WORLDS), thetas)
-        return jax.lax.scan(step, begun, jax.random.split(key, STEPS))[0].physics.q
+        return jax.lax.scan(step, begun, jax.random.split(key, STEPS))[0].qpos
 
     go(jax.random.key(0)).block_until_ready()
     began = time.perf_counter()

@@ -5,8 +5,8 @@ foot slides the least squares are not what holds there. Here f is what the const
 
     f ≥ 0,   A f + b ≥ 0,   fᵀ (A f + b) = 0,
 
-with A = J M⁻¹ Jᵀ + R and b = J M⁻¹ τ − a_ref as Brax makes them, by sweeps of projected Gauss-Seidel. The mass matrix is
-inverted, where Brax improves an inverse that it carries along.
+with A = J M⁻¹ Jᵀ + R and b = J M⁻¹ τ − a_ref as Brax makes them, by sweeps of projected Gauss-Seidel. The mass matrix
+is inverted, where Brax improves an inverse that it carries along.
 
 Source: Todorov 2014; Freeman et al. 2021
 """

@@ -1,6 +1,6 @@
-"""Hopper on Brax's physics: a leg in the plane, the model and the task of Gymnasium's `Hopper-v5`.
+"""Hopper: a leg in the plane, the model and the task of Gymnasium's `Hopper-v5`, on Brax's physics or on MuJoCo's.
 
-The model file is read where Brax is installed: `pip install 'bayessim-jax[brax]'`.
+The model file is read where Brax or Gymnasium is installed: `pip install 'bayessim-jax[brax]'`.
 
 Source: Freeman et al. 2021; Erez, Tassa and Todorov 2011
 """
@@ -19,16 +19,18 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from bayessim_jax.contracts import Box, Discrete, Scalar
 from bayessim_jax.systems import converged
+from bayessim_jax.systems.mjcf import Unknown, mjcf_system
 
 __all__ = ["PIPELINES", "Hop", "Hopper", "HopperState"]
 
-PIPELINES = ("converged", "generalized", "positional", "spring")
-"""Ours first, then Brax's as they come."""
+PIPELINES = ("converged", "generalized", "positional", "spring", "mujoco")
+"""Brax's dynamics with our contacts, Brax's own as they come, and MuJoCo's C engine: the target's, as a reference."""
 SUBSTEPS = 4
 SCATTER = 5e-3
 """Episodes begin with every position and velocity moved by up to this, m and rad, and per s."""
@@ -36,8 +38,10 @@ SCATTER = 5e-3
 
 @struct.dataclass
 class HopperState:
-    """Brax's state: `physics.q` and `physics.qd` are x and z of the torso, its pitch, three angles, and their rates."""
+    """x and z of the torso, its pitch and three angles, m and rad; their rates; and what the pipeline goes on from."""
 
+    qpos: Float[Array, "6"]
+    qvel: Float[Array, "6"]
     physics: Any
 
 
@@ -48,7 +52,8 @@ class Hopper:
     MuJoCo takes the larger friction of two geoms that touch, and so does Brax: θ is that of foot and floor. What is
     seen is what the environment shows: height and pitch of the torso, three angles, and the rates of all, clipped to
     ±10, with the speed along x as the first rate. `pipeline` says what steps it: `converged` is Brax's generalized
-    dynamics with the forces of contacts and stops solved to the end, the others are Brax's own.
+    dynamics with the forces of contacts and stops solved to the end; `generalized`, `positional` and `spring` are
+    Brax's own; `mujoco` is the C engine with the environment's model, and not differentiable.
 
     Source: Freeman et al. 2021
     """
@@ -98,21 +103,17 @@ class Hopper:
 
     def begin(self, theta: Float[Array, " d"], qpos: Float[Array, "6"], qvel: Float[Array, "6"]) -> HopperState:
         """The state with these coordinates: x and z of the torso, its pitch, three angles, and their rates."""
-        rise = jnp.zeros(6).at[1].set(_load_rise())
-        with _quiet():
-            return HopperState(_pipeline(self.pipeline).init(_with(theta), qpos - rise, qvel))
+        return HopperState(qpos, qvel, _stepper(self.pipeline).begin(theta, qpos, qvel))
 
     def step(self, theta: Float[Array, " d"], state: HopperState, action: Float[Array, " act"]) -> HopperState:
         """Advance by one control period of four time steps."""
-        model, pipeline = _with(theta), _pipeline(self.pipeline)
-        held = jnp.clip(action, -1.0, 1.0)
-        step = lambda physics, _: (pipeline.step(model, physics, held), None)  # noqa: E731
-        with _quiet():
-            return HopperState(jax.lax.scan(step, state.physics, None, length=SUBSTEPS)[0])
+        stepper = _stepper(self.pipeline)
+        physics = stepper.step(theta, state.physics, jnp.clip(action, -1.0, 1.0))
+        return HopperState(*stepper.show(physics), physics)
 
     def observe(self, theta: Float[Array, " d"], state: HopperState) -> Float[Array, " obs"]:
         """Everything but the way along x."""
-        return jnp.concatenate([_coordinates(state)[1:], jnp.clip(state.physics.qd, -10.0, 10.0)])
+        return jnp.concatenate([state.qpos[1:], jnp.clip(state.qvel, -10.0, 10.0)])
 
 
 @struct.dataclass
@@ -128,19 +129,58 @@ class Hop:
 
     def reward(self, state: HopperState, action: Float[Array, " act"], next_state: HopperState) -> Scalar:
         """What Gymnasium's environment pays."""
-        speed = (next_state.physics.q[0] - state.physics.q[0]) / (SUBSTEPS * float(_load().opt.timestep))
+        speed = (next_state.qpos[0] - state.qpos[0]) / (SUBSTEPS * float(_load().opt.timestep))
         return speed + ~self.terminated(next_state) - 1e-3 * jnp.sum(action**2)
 
     def terminated(self, state: HopperState) -> Bool[Array, ""]:
         """Fallen."""
-        place = _coordinates(state)
-        rest = jnp.concatenate([place[2:], state.physics.qd])
-        return ~((place[1] > 0.7) & (jnp.abs(place[2]) < 0.2) & (jnp.abs(rest) < 100.0).all())
+        _, height, pitch, *_ = state.qpos
+        rest = jnp.concatenate([state.qpos[2:], state.qvel])
+        return ~((height > 0.7) & (jnp.abs(pitch) < 0.2) & (jnp.abs(rest) < 100.0).all())
 
 
-def _coordinates(state: HopperState) -> Any:
-    """Brax counts the height from where the torso stands upright."""
-    return state.physics.q.at[1].add(_load_rise())
+class _Brax:
+    """One of Brax's pipelines, or ours. Brax counts the height from where the torso stands upright."""
+
+    def __init__(self, name: str) -> None:
+        with _quiet():
+            self.pipeline: Any = converged if name == "converged" else importlib.import_module(f"brax.{name}.pipeline")
+        self.rise = np.array([0.0, _load_rise(), 0.0, 0.0, 0.0, 0.0], np.float32)
+
+    def begin(self, theta: Array, qpos: Array, qvel: Array) -> Any:
+        with _quiet():
+            return self.pipeline.init(_with(theta), qpos - self.rise, qvel)
+
+    def step(self, theta: Array, physics: Any, action: Array) -> Any:
+        model = _with(theta)
+        step = lambda physics, _: (self.pipeline.step(model, physics, action), None)  # noqa: E731
+        with _quiet():
+            return jax.lax.scan(step, physics, None, length=SUBSTEPS)[0]
+
+    def show(self, physics: Any) -> tuple[Array, Array]:
+        return physics.q + self.rise, physics.qd
+
+
+class _Mujoco:
+    """The environment's own model file on the C engine."""
+
+    def __init__(self) -> None:
+        found = importlib.util.find_spec("gymnasium")
+        assert found is not None
+        assert found.origin is not None
+        path = Path(found.origin).parent / "envs" / "mujoco" / "assets" / "hopper.xml"
+        geoms = ("floor", *(f"{link}_geom" for link in ("torso", "thigh", "leg", "foot")))
+        friction = Unknown("friction", tuple(f"geom/{geom}/friction/0" for geom in geoms), 0.1, 0.5)
+        self.engine = mjcf_system(path, [friction], engine="mujoco").engine
+
+    def begin(self, theta: Array, qpos: Array, qvel: Array) -> Any:
+        return self.engine.init(theta, qpos, qvel)
+
+    def step(self, theta: Array, physics: Any, action: Array) -> Any:
+        return self.engine.step(theta, physics, action, None, SUBSTEPS)
+
+    def show(self, physics: Any) -> tuple[Array, Array]:
+        return physics.qpos, physics.qvel
 
 
 @cache
@@ -171,9 +211,8 @@ def _load_rise() -> float:
 
 
 @cache
-def _pipeline(name: str) -> Any:
-    with _quiet():
-        return converged if name == "converged" else importlib.import_module(f"brax.{name}.pipeline")
+def _stepper(name: str) -> _Brax | _Mujoco:
+    return _Mujoco() if name == "mujoco" else _Brax(name)
 
 
 def _with(theta: Any) -> Any:
