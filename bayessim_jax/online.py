@@ -28,6 +28,7 @@ from bayessim_jax.contracts import Estimator, GoalTask, Learner, Policy, Recordi
 from bayessim_jax.inference.encoders import features_of
 from bayessim_jax.inference.estimators import recurrent_mixture
 from bayessim_jax.inference.proposals import ProposalMode, lookup_proposal, pool_weights
+from bayessim_jax.inference.strangeness import strangeness
 from bayessim_jax.learning.fixed import RecordedActions
 from bayessim_jax.rollout import rollout
 
@@ -199,6 +200,9 @@ class RoundInfo:
     """The posterior of this round was wider than the belief and agreed with it, so the belief stayed."""
     collapsed: Bool[Array, ""]
     """The belief is a posterior whose networks collapsed: `calibration.collapsed`."""
+    strangeness: Scalar
+    """By how many standard deviations what the target showed lies farther out than what is simulated around the belief
+    (`inference.strangeness`); NaN where nothing was recorded."""
 
 
 class Keys(NamedTuple):
@@ -371,6 +375,7 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
         pool_size=weights.sum() ** 2 / (weights**2).sum(),
         uninformed=uninformed,
         collapsed=calibration.collapsed & ~stays,
+        strangeness=strangeness(sets, history, use),
     )
     after = State(state.round + 1, belief, estimator, learner, pool, kept, history, policies)
     return jax.lax.optimization_barrier((after, info))

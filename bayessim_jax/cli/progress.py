@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
 
+from bayessim_jax.inference.strangeness import STRANGE
+
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
@@ -31,6 +33,8 @@ def describe(lines: Sequence[Mapping[str, Any]], left: float) -> str:
     parts.append(f"{_duration(left)} left")
     marks = ("overconfident", "over-confident"), ("overfit", "over-fitted"), ("collapsed", "collapsed")
     parts += [word for name, word in marks if any(line.get(name) for line in lines)]
+    if any((line.get("strangeness") or 0.0) > STRANGE for line in lines):
+        parts.append("strange")
     if diverged := sum(line["diverged"] for line in lines):
         parts.append(f"{diverged} diverged")
     return "  ".join(parts)

@@ -36,7 +36,11 @@ DEFAULTS: dict[str, tuple[str, dict[str, Any]]] = {
     "pendulum": ("sac", {"episodes": 75, "episode_steps": 200, "entropy_target": -3.0}),
     "acrobot": ("ppo", {"episodes": 30, "episode_steps": 500, "gamma": 0.995}),
     "skid_steer": ("sac", {"episodes": 30, "episode_steps": 500}),
-    "hopper": ("ppo", {"episodes": 30, "episode_steps": 500, "gamma": 0.99}),
+    "hopper": (
+        "ppo",
+        {"episodes": 30, "episode_steps": 500, "gamma": 0.995, "horizon": 100, "learning_rate": 3e-4}
+        | {"epochs": 10, "minibatches": 15},
+    ),
     "fetch_push": ("her", {}),
     "fetch_slide": ("her", {}),
     "diagnosed": ("sac", {"episodes": 75, "episode_steps": 200}),

@@ -92,6 +92,7 @@ def metrics_line(
         "overconfident": bool(info.calibration.overconfident),
         "uninformed": bool(info.uninformed),
         "collapsed": bool(info.collapsed),
+        "strangeness": float(info.strangeness),
         "pool_size": float(info.pool_size),
         "log_q_train": float(info.fit.log_q_train),
         "log_q_validation": float(info.fit.log_q_validation),

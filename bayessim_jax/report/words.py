@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bayessim_jax.inference.strangeness import STRANGE
 from bayessim_jax.report.evidence import OnlineRun
 
 if TYPE_CHECKING:
@@ -110,6 +111,14 @@ def worries(run: OnlineRun) -> list[str]:
     fallen = int((at("prior_share") >= 0.999).sum())
     if fallen:
         found.append(f"The last fit gave no usable posterior{_in(fallen, several)}, so the prior stands.")
+    strange = at("strangeness")
+    if (n := int((strange > STRANGE).sum())) > 0:
+        found.append(
+            f"What the target showed is unlike what is simulated{_in(n, several)}: it lies "
+            f"{number(float(np.nanmax(strange)), 2)} standard deviations farther out than simulated recordings do. "
+            "Something is missing in the simulator, or the belief has lost the truth; what the simulator lacks is read "
+            "as parameters, so do not trust the posterior."
+        )
     collapsed = int(np.nansum(run.series("collapsed")))
     if collapsed:
         share = float(np.nanmin(run.series("coverage90_network")))

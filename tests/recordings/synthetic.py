@@ -80,6 +80,7 @@ def one_info(system, index, truth, steps=5, recordings=2, **flags):
         pool_size=jnp.array(100.0),
         uninformed=flag("uninformed"),
         collapsed=flag("collapsed"),
+        strangeness=jnp.array(flags.get("strangeness", 0.3)),
     )
 
 

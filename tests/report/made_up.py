@@ -44,6 +44,7 @@ def made_up(rounds=16, seeds=1, d=2, known=True, **changes):
                 "overfit": False,
                 "overconfident": False,
                 "collapsed": False,
+                "strangeness": 0.3,
                 "prior_share": 0.0,
                 "log_q_train": 1.2 * r**0.5,
                 "log_q_validation": r**0.5,

@@ -53,6 +53,7 @@ def test_several_seeds_are_summed_up():
         ({"overconfident": True, "coverage90": 0.6}, "over-confident: only 60%"),
         ({"overfit": True}, "over-fitted after its best epoch"),
         ({"collapsed": True}, "collapsed in 4 rounds"),
+        ({"strangeness": 12.0}, "unlike what is simulated: it lies 12 standard deviations"),
         ({"prior_share": 1.0}, "no usable posterior"),
         ({"diverged": 2}, "8 simulations gave numbers that are not finite"),
         ({"nonfinite": 1}, "4 updates"),
