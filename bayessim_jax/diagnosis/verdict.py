@@ -273,10 +273,13 @@ def may_be_named(entry: Entry, entries: Sequence[Entry], none: Entry, thresholds
 def _tied(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> list[Entry]:
     """What predicts as well as the best, which comes first, and special cases of that which leave next to nothing.
 
-    What these leave says less of physics than of how a sign is rounded, in the library and in a machine.
+    What these leave says less of physics than of how a sign is rounded, in the library and in a machine. Where sensors
+    are coarse nothing is left of any of them; then they also have to predict held-out windows nearly as well.
     """
-    tied = [entry for entry in entries if ties(entry, entries[0], none, thresholds)]
-    simpler = (entry for entry in entries if share_left(entry.misfit, none.misfit) <= thresholds.form)
+    best = entries[0]
+    tied = [entry for entry in entries if ties(entry, best, none, thresholds)]
+    near = best.score - thresholds.blur * (best.score - none.score)
+    simpler = (e for e in entries if e.score >= near and share_left(e.misfit, none.misfit) <= thresholds.form)
     return tied + [e for e in simpler if e not in tied and any(has_special_case(other, e) for other in tied)]
 
 
