@@ -116,21 +116,9 @@ def compare(system: Hopper, states: np.ndarray, actions: np.ndarray, thetas: np.
 
 def follow(system: Hopper, states: np.ndarray, actions: np.ndarray, thetas: np.ndarray) -> np.ndarray:
     """Squared difference of all rates over a recording, for θ times each of the ratios [episode, ratio]."""
-
-    @jax.jit
-    def errors(theta: Any, states: Any, actions: Any) -> Any:
-        def one(ratio: Any) -> Any:
-            def step(state: Any, x: Any) -> Any:
-                after = system.step(ratio * theta, state, x[0])
-                return after, jnp.sum((after.qvel - x[1][6:]) ** 2)
-
-            begun = system.begin(ratio * theta, states[0, :6], states[0, 6:])
-            return jax.lax.scan(step, begun, (actions, states[1:]))[1].sum()
-
-        return jax.vmap(one)(jnp.asarray(RATIOS, jnp.float32))
-
-    rows = [jnp.asarray(x, jnp.float32) for x in (thetas, states, actions)]
-    return np.asarray(jax.lax.map(lambda row: errors(*row), tuple(rows)))
+    scaled = (thetas[:, None] * RATIOS[:, None]).reshape(-1, 1)
+    gaps, *_ = compare(system, *(np.repeat(x, len(RATIOS), axis=0) for x in (states, actions)), scaled)
+    return (gaps[..., 5:] ** 2).sum((1, 2)).reshape(-1, len(RATIOS))
 
 
 def count_steps(system: Hopper) -> float:

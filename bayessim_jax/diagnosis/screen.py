@@ -106,7 +106,7 @@ class Screen:
             places = ndtri(np.clip(shares[:, None] + apart, EDGE, 1.0 - EDGE))
             grids.append([list(zip(together, place, strict=True)) for place in places])
         # where a sign is open a scan begins in the middle: from the wrong sign the first steps do not come back
-        middle = np.array([0.0 if p.low < 0.0 else 1.0 for p, _ in each]) * begin
+        middle = np.where(signs < 0.0, 0.0, begin)
         for chosen in product(*grids) if grids else ():
             point = middle.copy()
             for k, z in chain(*chosen):

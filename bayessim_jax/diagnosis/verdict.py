@@ -98,7 +98,8 @@ class Thresholds:
     tie: float = 2.0
     """Standard errors within which two candidates predict held-out windows alike."""
     blur: float = 0.005
-    """Share of what the best candidate gains by which others may be worse and tie, where it is not wholly right."""
+    """Share of what the best candidate gains by which others may be worse and tie, where it is not wholly right, and by
+    which a special case may be worse and be the finding."""
     form: float = 0.001
     """Share of the misfit that a special case may leave and be the finding: the form of laws is no better known."""
     least: float = 4.0

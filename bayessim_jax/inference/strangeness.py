@@ -32,32 +32,28 @@ def strangeness(simulated: Recording, observed: Recording, use: Bool[Array, " se
     """By how many standard deviations observed recordings lie farther out than simulated ones, of which it is a set.
 
     `simulated` has axes (draw of θ, recording, …), `observed` the axis of recordings, and `use` says which count. Half
-    of the draws teach what is usual: Δy = B (1, y, u) + e by least squares, and of the mean and the logarithmic spread
-    of y and of e, channel by channel in every recording, the mean under each policy and one covariance. D, the sum over
-    recordings of squared Mahalanobis distances, is then taken of the other draws and of what was observed, and
+    of the draws teach what is usual: Δy = B (1, y, u) + e by least squares; of every recording how long it lasts, mean
+    and logarithmic spread of each channel of y and of e, and the least squares of its own e on (1, y, u); of these
+    numbers the mean under each policy and one covariance, shrunk towards its diagonal. D, the sum over recordings of
+    squared Mahalanobis distances, is then taken of the other draws and of what was observed, and
 
         strangeness = (log D − mean log D) / sd log D,
 
     sd the root mean square of those above the mean, for distances are skewed. 0 is usual; NaN where nothing counts, or
     there are less than `FEWEST` draws. Parameters differ between draws, so that what they explain is not strange.
     """
-    draws = simulated.valid.shape[0]
+    draws = min(simulated.valid.shape[0], MOST)
     if draws < FEWEST:
         return jnp.array(jnp.nan)
-    simulated = jax.tree.map(lambda leaf: leaf[:MOST], simulated)
-    taught = min(draws, MOST) // 2
+    simulated = jax.tree.map(lambda leaf: leaf[:draws], simulated)
+    taught = draws // 2
     counts = use & ~observed.diverged
     centre, unit = _moments(simulated, simulated.valid & counts[:, None])
-    standard = lambda recording: _standardize(recording, centre, unit)  # noqa: E731
-    x, dy, valid = standard(simulated)
-    weights = (valid & counts[:, None]).at[taught:].set(False).reshape(-1).astype(x.dtype)
-    rows, moves = x.reshape(-1, x.shape[-1]), dy.reshape(-1, dy.shape[-1])
-    gram = (rows * weights[:, None]).T @ rows
-    slopes = jnp.linalg.solve(
-        gram + RIDGE * jnp.maximum(weights.sum(), 1.0) * jnp.eye(gram.shape[0]), (rows * weights[:, None]).T @ moves
-    )
-    summaries = _summarize(x, dy, valid, slopes)
-    seen = _summarize(*standard(observed), slopes)
+    x, moves = _standardize(simulated, centre, unit)
+    taken = jnp.where(counts[:, None, None], x[:taught], 0.0)
+    slopes = _least_squares(taken.reshape(-1, x.shape[-1]), moves[:taught].reshape(-1, moves.shape[-1]), RIDGE)
+    summaries = _summarize(x, moves, slopes)
+    seen = _summarize(*_standardize(observed, centre, unit), slopes)
 
     means = summaries[:taught].mean(0)
     left = jnp.where(counts[:, None], summaries[:taught] - means, 0.0).reshape(-1, summaries.shape[-1])
@@ -79,39 +75,51 @@ def strangeness(simulated: Recording, observed: Recording, use: Bool[Array, " se
     return jnp.where(counts.any(), found, jnp.nan)
 
 
-def _moments(recording: Recording, valid: Bool[Array, "*batch steps"]) -> tuple[Array, Array]:
+def _transitions(recordings: Recording) -> tuple[Array, Array]:
+    """(y, u) and Δy."""
+    now, later = recordings.observations[..., :-1, :], recordings.observations[..., 1:, :]
+    return jnp.concatenate([now, recordings.actions], -1), later - now
+
+
+def _moments(recordings: Recording, valid: Bool[Array, "*batch steps"]) -> tuple[Array, Array]:
     """Mean and standard deviation of what is observed and commanded."""
-    both = jnp.concatenate([recording.observations[..., :-1, :], recording.actions], -1)
+    given, _ = _transitions(recordings)
     mask = valid[..., None]
-    total, axes = jnp.maximum(mask.sum(), 1), tuple(range(both.ndim - 1))
-    mean = jnp.where(mask, both, 0.0).sum(axes) / total
-    spread = jnp.sqrt(jnp.where(mask, (both - mean) ** 2, 0.0).sum(axes) / total)
+    total, axes = jnp.maximum(mask.sum(), 1), tuple(range(given.ndim - 1))
+    mean = jnp.where(mask, given, 0.0).sum(axes) / total
+    spread = jnp.sqrt(jnp.where(mask, (given - mean) ** 2, 0.0).sum(axes) / total)
     return mean, spread + 1e-6
 
 
-def _standardize(recording: Recording, centre: Array, unit: Array) -> tuple[Array, Array, Array]:
-    """(1, y, u), Δy, and which transitions there are."""
-    size = recording.observations.shape[-1]
-    now = recording.observations[..., :-1, :]
-    both = (jnp.concatenate([now, recording.actions], -1) - centre) / unit
-    moves = (recording.observations[..., 1:, :] - now) / unit[:size]
-    mask = recording.valid[..., None]
-    x = jnp.concatenate([jnp.ones_like(both[..., :1]), jnp.clip(both, -10.0, 10.0)], -1)
-    return jnp.where(mask, x, 0.0), jnp.where(mask, jnp.clip(moves, -10.0, 10.0), 0.0), recording.valid
+def _standardize(recordings: Recording, centre: Array, unit: Array) -> tuple[Array, Array]:
+    """(1, y, u) and Δy; rows of zeros where a transition did not happen."""
+    given, moves = _transitions(recordings)
+    given, moves = (given - centre) / unit, moves / unit[: moves.shape[-1]]
+    x = jnp.concatenate([jnp.ones_like(given[..., :1]), jnp.clip(given, -10.0, 10.0)], -1)
+    mask = recordings.valid[..., None]
+    return jnp.where(mask, x, 0.0), jnp.where(mask, jnp.clip(moves, -10.0, 10.0), 0.0)
 
 
-def _summarize(x: Array, dy: Array, valid: Array, slopes: Array) -> Float[Array, "*batch k"]:
-    """How long it lasts; mean and logarithmic spread of every channel, and of what the least squares miss of its moves;
-    and the least squares of the latter.
+def _least_squares(
+    x: Float[Array, "*batch rows k"], y: Float[Array, "*batch rows obs"], ridge: float
+) -> Float[Array, "*batch k obs"]:
+    """Slopes of y on x, held by a ridge of so much for every row that is not zero."""
+    rows = jnp.maximum(x[..., 0].sum(-1), 1.0)[..., None, None]
+    gram = jnp.einsum("...ti,...tj->...ij", x, x) + ridge * rows * jnp.eye(x.shape[-1])
+    return jnp.linalg.solve(gram, jnp.einsum("...ti,...tj->...ij", x, y))
+
+
+def _summarize(x: Array, moves: Array, slopes: Array) -> Float[Array, "*batch k"]:
+    """How long a recording lasts; the least squares of what `slopes` miss of its moves; mean and logarithmic spread of
+    that, and of every channel.
     """
-    size = dy.shape[-1]
-    count = jnp.maximum(valid.sum(-1), 1)[..., None]
-    missed = jnp.where(valid[..., None], dy - x @ slopes, 0.0)
-    gram = jnp.einsum("...ti,...tj->...ij", x, x) + OWN_RIDGE * count[..., None] * jnp.eye(x.shape[-1])
-    own = jnp.linalg.solve(gram, jnp.einsum("...ti,...tj->...ij", x, missed))
-    parts = [valid.mean(-1, keepdims=True), own.reshape(*own.shape[:-2], -1)]
+    size, there = moves.shape[-1], x[..., :1]
+    count = jnp.maximum(there.sum(-2), 1.0)
+    missed = moves - x @ slopes
+    own = _least_squares(x, missed, OWN_RIDGE)
+    parts = [there.mean(-2), own.reshape(*own.shape[:-2], -1)]
     for values in (x[..., 1 : 1 + size], missed):
         mean = values.sum(-2) / count
-        square = jnp.where(valid[..., None], (values - mean[..., None, :]) ** 2, 0.0).sum(-2) / count
+        square = (there * (values - mean[..., None, :]) ** 2).sum(-2) / count
         parts += [mean, 0.5 * jnp.log(square + 1e-8)]
     return jnp.concatenate(parts, -1)

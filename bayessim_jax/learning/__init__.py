@@ -38,8 +38,15 @@ DEFAULTS: dict[str, tuple[str, dict[str, Any]]] = {
     "skid_steer": ("sac", {"episodes": 30, "episode_steps": 500}),
     "hopper": (
         "ppo",
-        {"episodes": 30, "episode_steps": 500, "gamma": 0.995, "horizon": 100, "learning_rate": 3e-4}
-        | {"epochs": 10, "minibatches": 15},
+        {
+            "episodes": 30,
+            "episode_steps": 500,
+            "gamma": 0.995,
+            "horizon": 100,
+            "epochs": 10,
+            "minibatches": 15,
+            "learning_rate": 3e-4,
+        },
     ),
     "fetch_push": ("her", {}),
     "fetch_slide": ("her", {}),

@@ -17,6 +17,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -165,10 +166,7 @@ class _Mujoco:
     """The environment's own model file on the C engine."""
 
     def __init__(self) -> None:
-        found = importlib.util.find_spec("gymnasium")
-        assert found is not None
-        assert found.origin is not None
-        path = Path(found.origin).parent / "envs" / "mujoco" / "assets" / "hopper.xml"
+        path = Path(str(gymnasium.__file__)).parent / "envs" / "mujoco" / "assets" / "hopper.xml"
         geoms = ("floor", *(f"{link}_geom" for link in ("torso", "thigh", "leg", "foot")))
         friction = Unknown("friction", tuple(f"geom/{geom}/friction/0" for geom in geoms), 0.1, 0.5)
         self.engine = mjcf_system(path, [friction], engine="mujoco").engine
@@ -192,7 +190,7 @@ def _load() -> Any:
     with _quiet(), jax.ensure_compile_time_eval():
         mjcf: Any = importlib.import_module("brax.io.mjcf")
         model = mjcf.load(str(Path(found.origin).parent / "envs" / "assets" / "hopper.xml"))
-        # MuJoCo's contacts act within a margin, Brax's where geoms overlap
+        # MuJoCo's contacts act within a margin, Brax's where geoms overlap: the floor, geom 0, is raised by it
         return model.replace(geom_pos=jnp.asarray(model.geom_pos).at[0, 2].add(float(model.mj_model.geom_margin[0])))
 
 

@@ -173,6 +173,8 @@ def test_fits_begin_all_over_parameters_with_many_maxima(problem):
     assert len(np.unique(ripple[:, parameters["cycles"]].round(9))) >= 20
     begin, end = (screen.scene.margin[1][k].value(event[:10, k]) for k in (0, 1))
     assert (begin < end).all() and np.ptp(begin) > 0.6 * problem.scales["joint/hinge"].duration
+    # whichever way the push went, a scan of its time begins from none
+    np.testing.assert_allclose(screen.scene.margin[1][2].value(event[2:10, 2]), 0.0, atol=1e-9)
     assert viscous.shape == (3, 1)
 
 

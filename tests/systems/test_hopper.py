@@ -10,7 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from bayessim_jax.beliefs import Uniform
 from bayessim_jax.engines.gymnasium import GYMNASIUM
+from bayessim_jax.inference.strangeness import STRANGE, strangeness
+from bayessim_jax.learning import default_learner
+from bayessim_jax.rollout import rollout
 from bayessim_jax.systems import Hop, Hopper, hopper
 from bayessim_jax.systems.converged import solve_complementarity
 
@@ -67,6 +71,37 @@ def test_friction_that_follows_the_environment_is_the_environments():
     """With Brax's own solver a sliding foot needs more than half as much again."""
     errors = follow(Hopper.create(noise=0.0), *record(30, 15, 0, speed=1.0))
     assert 0.9 < RATIOS[errors.sum(0).argmin()] < 1.1
+
+
+@pytest.mark.slow
+def test_brax_as_it_comes_is_strange_and_the_targets_engine_is_not():
+    """Sets of eight recordings under a policy that hops, beside simulations around the true friction."""
+    system, task = Hopper.create(), Hop()
+    learner, belief = default_learner("hopper", system, task), Uniform(system.parameters)
+
+    def improve(state, key):
+        return learner.step(key, state, belief)[0], None
+
+    state = learner.init(jax.random.key(0))
+    policy = learner.policy(
+        jax.jit(lambda s, k: jax.lax.scan(improve, s, k)[0])(state, jax.random.split(jax.random.key(4), 20))
+    )
+
+    def sets(pipeline, key, thetas):
+        physics = Hopper.create(pipeline=pipeline)
+        one = lambda key, theta: rollout(key, physics, theta, policy, 50, task)  # noqa: E731
+        return jax.jit(jax.vmap(jax.vmap(one, (0, None))))(jax.random.split(key, (len(thetas), 8)), thetas)
+
+    usual = sets(
+        "converged", jax.random.key(1), jax.random.uniform(jax.random.key(2), (64, 1), minval=0.29, maxval=0.31)
+    )
+    judge = jax.jit(jax.vmap(strangeness, (None, 0, None)))
+    true = jnp.full((24, 1), 0.3)
+    found = {
+        name: judge(usual, sets(name, jax.random.key(3), true), jnp.ones(8, bool)) for name in ("mujoco", "generalized")
+    }
+    assert np.max(found["mujoco"]) < STRANGE
+    assert np.min(found["generalized"]) > 2 * STRANGE
 
 
 def test_forces_are_complementary():
