@@ -20,6 +20,7 @@ from typing import Any
 import gymnasium
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
@@ -53,8 +54,9 @@ class Hopper:
     MuJoCo takes the larger friction of two geoms that touch, and so does Brax: θ is that of foot and floor. What is
     seen is what the environment shows: height and pitch of the torso, three angles, and the rates of all, clipped to
     ±10, with the speed along x as the first rate. `pipeline` says what steps it: `converged` is Brax's generalized
-    dynamics with the forces of contacts and stops solved to the end; `generalized`, `positional` and `spring` are
-    Brax's own; `mujoco` is the C engine with the environment's model, and not differentiable.
+    dynamics with the forces of contacts and stops solved to the end, and MuJoCo's integrator; `generalized`,
+    `positional` and `spring` are Brax's own; `mujoco` is the C engine with the environment's model, and not
+    differentiable.
 
     Source: Freeman et al. 2021
     """
@@ -191,7 +193,11 @@ def _load() -> Any:
         mjcf: Any = importlib.import_module("brax.io.mjcf")
         model = mjcf.load(str(Path(found.origin).parent / "envs" / "assets" / "hopper.xml"))
         # MuJoCo's contacts act within a margin, Brax's where geoms overlap: the floor, geom 0, is raised by it
-        return model.replace(geom_pos=jnp.asarray(model.geom_pos).at[0, 2].add(float(model.mj_model.geom_margin[0])))
+        data = mujoco.MjData(model.mj_model)
+        data.qpos[1] = -0.2
+        mujoco.mj_forward(model.mj_model, data)
+        margin = float(data.contact.includemargin.max())
+        return model.replace(geom_pos=jnp.asarray(model.geom_pos).at[0, 2].add(margin))
 
 
 @contextlib.contextmanager
