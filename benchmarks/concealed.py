@@ -40,6 +40,15 @@ GROUPS = {"single": 0.37, "weak": 0.1, "pair": 0.1, "unknown": 0.18, "clean": 0.
 STRENGTHS = {"weak": (0.02, 0.1)}
 """Log-uniform between these; of all other groups between 0.1 and 0.6."""
 NOISE = (0.3, 1.0, 3.0)
+ONE_LAW = (
+    {"coulomb_friction", "stribeck_friction"},
+    {"coulomb_friction", "asymmetric_friction"},
+    {"coulomb_friction", "load_dependent_friction"},
+    {"viscous_friction", "back_emf"},
+    {"base_tilt", "sensor_offset", "link_offset"},
+    {"armature", "payload", "link_offset"},
+)
+"""Effects of which two at one joint are one of them with other numbers: no pairs."""
 ATTEMPTS = 5
 FINER = 4
 """Times that machines take shorter time steps than `bayessim conceal` does: 1/16 of the model's own."""
@@ -75,7 +84,8 @@ def draw_cases(rigs: list[str], count: int, seed: int, finer: int = FINER) -> li
         fitting = [rig for rig in rigs if _fits(effects, rig)]
         rig = str(fitting[int(rng.integers(len(fitting)))])
         if group == "pair":
-            second = [name for name in library if name != effects[0] and _fits([name], rig)]
+            one = set().union(*(law for law in ONE_LAW if effects[0] in law))
+            second = [name for name in library if name not in {effects[0], *one} and _fits([name], rig)]
             effects.append(str(rng.choice(second)))
         low, high = STRENGTHS.get(group, (0.1, 0.6))
         cases.append(
@@ -134,9 +144,9 @@ def judge(sealed: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
     """What became of a case.
 
     `outcome` is `clean` or `false alarm` where nothing is concealed; else `missed` (no mismatch), `refused`
-    (unexplained), `named` (the one answer), `among` (one of at most three answers), `part` (some of a pair and nothing
-    else) or `wrong`. `joint` says whether most of the misfit was located at a joint with an effect, None where that is
-    at none.
+    (unexplained), `named` (the one answer), `among` (one of at most three answers), `crowd` (one of more), `part` (some
+    of a pair and nothing else) or `wrong`. `joint` says whether most of the misfit was located at a joint with an
+    effect, None where that is at none.
     """
     truth = set(_hidden(sealed))
     joints = {e["joint"] for e in sealed["effects"]} - {None}
@@ -148,8 +158,8 @@ def judge(sealed: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
         outcome = "clean" if verdict == "no_mismatch" else "false alarm"
     elif verdict in ("no_mismatch", "unexplained"):
         outcome = "missed" if verdict == "no_mismatch" else "refused"
-    elif truth in answers and len(answers) <= 3:
-        outcome = "named" if len(answers) == 1 else "among"
+    elif truth in answers:
+        outcome = "named" if len(answers) == 1 else "among" if len(answers) <= 3 else "crowd"
     else:
         outcome = "part" if any(answer < truth for answer in answers) else "wrong"
     return {
