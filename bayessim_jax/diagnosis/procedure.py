@@ -29,6 +29,7 @@ from bayessim_jax.diagnosis.verdict import (
     are_kin,
     can_stand_for,
     contains,
+    contenders,
     decide,
     error_left,
     explains,
@@ -36,7 +37,6 @@ from bayessim_jax.diagnosis.verdict import (
     is_worth,
     may_be_named,
     share_left,
-    ties,
 )
 from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, judge_misfit
 from bayessim_jax.effects import Scales
@@ -249,6 +249,10 @@ def name_effects(
                 wider = sorted(wider, key=lambda found: -found.score)[:PAIRS]
                 kept = [*wider, *kept]
                 entries = finish(kept)
+            spared = _spare(work, screen, entries, kept) if entries else []
+            if spared:
+                say("trying what is left without each of its effects")
+                entries = finish([*spared, *kept])
     return decide(work.bench, none, entries, work.group, thresholds, listed)
 
 
@@ -280,6 +284,21 @@ def _settled(screen: Screen, entry: Entry, kept: Sequence[Screened]) -> Screened
     # a twin may not have been along the motion before; the corrections of the best that was do as a beginning
     known = next((found for found in kept if found.candidate == entry.candidate), kept[0])
     return screen.settle(entry.candidate, entry.fit.z, known.delta, entry.fit.sigma) or known
+
+
+def _spare(work: _Work, screen: Screen, entries: Sequence[Entry], kept: Sequence[Screened]) -> list[Screened]:
+    """The best set without each of its effects, where that has not been simulated: sets grow towards what they lack.
+
+    What mimicked the rest first may be of no use beside the rest.
+    """
+    best = entries[0]
+    effects = best.candidate.effects
+    if len(effects) <= 2:
+        return []
+    whole = _settled(screen, best, kept)
+    parts = [screen.part(whole, tuple(k for k in effects if k != spared)) for spared in effects]
+    ended = [screen.settle(p.candidate, p.p, p.delta, p.sigma) for p in parts if p.candidate not in work.done]
+    return [each for each in ended if each is not None]
 
 
 class _Growth:
@@ -602,7 +621,7 @@ def _finish(
     The best of those with many parameters that leave more than `remain` says of the motion are fitted from their usual
     values, too: where joints stick and slip, what fits there may be far from what fits in simulation. Rivals of the
     best and parts of it are fitted from its numbers, and where one of them is then the best or ties with it, so are its
-    own: none must win by a better start. Special cases and twins of the effects of what ties for the best are tried
+    own: none must win by a better start. Special cases and twins of the effects of what may be the answer are tried
     in their places. What was fitted before is taken as it was.
     """
     bench, before = work.bench, dict(work.done)
@@ -651,10 +670,10 @@ def _finish(
         _replace(work, entries, zip(again, pool.map(from_usual, again), strict=True))
         for _ in range(TURNS if entries else 0):
             best = entries[0]
-            if best.candidate in before:
-                break
             tried = {entry.candidate for entry in entries}
-            tied = [entry for entry in entries if ties(entry, best, none, thresholds)]
+            tied = contenders(entries, none, thresholds)
+            if all(entry.candidate in before for entry in tied):
+                break
             alike = [(s, entry) for entry in tied for s in _stand_ins(bench, entry.candidate) if s not in tried]
             simpler = list({s: (s, entry) for s, entry in reversed(alike)}.values())[::-1][:AGAIN]
             begun = [_with_numbers_of(bench, e, s, bench.starts(s, jnp.zeros(bench.d))[-1]) for s, e in simpler]
@@ -663,7 +682,7 @@ def _finish(
             rivals = [entry for entry in entries if _are_rivals(entry, best, none, thresholds)][:AGAIN]
             rivals += [entry for entry in entries if set(entry.names) < set(best.names)]
             _replace(work, entries, zip(rivals, pool.map(partial(from_numbers_of, best), rivals), strict=True))
-            now_tied = {entry.candidate for entry in entries if ties(entry, best, none, thresholds)}
+            now_tied = {entry.candidate for entry in contenders(entries, none, thresholds)}
             if entries[0] is best and now_tied <= {entry.candidate for entry in tied}:
                 break
     work.done |= {entry.candidate: entry for entry in entries}

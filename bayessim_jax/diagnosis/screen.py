@@ -35,6 +35,8 @@ INERTIAS, BAD = ("kg", "kg m²"), 1.5
 RACES = ((3, False, 4), (4, True, 2), (6, True, 2))
 """Steps of the solver from the points that a candidate is begun from, whether parameters that are scanned move, and how
 many points go on; one race after the other."""
+SCAN = ((2, False, 2),)
+"""The same for a scan beside what is known."""
 LASTING = 8
 """Further steps of those that went on."""
 LEAST_SHARE = 0.2
@@ -300,13 +302,20 @@ class Screen:
     ) -> list[tuple[Any, Array]]:
         """Points (p, δ) of a candidate beside a fit of a part of it.
 
-        What is added begins nearly neutral, as usual, or as it was fitted `alone`.
+        What is added begins nearly neutral, as usual, or as it was fitted `alone`; where parameters are scanned, also
+        at the best points of the scan beside what is known.
         """
         added = Candidate(tuple(k for k in candidate.effects if k not in known.candidate.effects))
         begin, weak = self._begin(added), self._begin(added, NEAR)
         points = [weak, begin] if np.abs(begin - weak).max(initial=0.0) > 0.0 else [begin]
         starts = [*points, *([alone] if alone is not None else [])]
-        return [(self._put(added, known, start), known.delta) for start in starts]
+        ends = [(self._put(added, known, start), known.delta) for start in starts]
+        if any(p.scan for k in added.effects for p in self.scene.parameters[k]):
+            scan = [(self._put(added, known, start), known.delta) for start in self.starts(added)]
+            self.scene.begin_around(known.candidate, known.p)
+            found = self._race(candidate, known, scan, SCAN)
+            ends += found.ends if found is not None else []
+        return ends
 
     def glance(
         self, candidate: Candidate, known: Screened, ends: Sequence[tuple[Any, Array]], steps: int

@@ -21,6 +21,7 @@ __all__ = [
     "are_kin",
     "can_stand_for",
     "contains",
+    "contenders",
     "decide",
     "error_left",
     "explains",
@@ -244,9 +245,7 @@ def decide(
     result = Diagnosis("unexplained", bench, none, entries, screened=screened)
     if not entries or entries[0].score - none.score < thresholds.least:
         return result
-    tied = _tied(entries, none, thresholds)
-    # what more effects explain has to be worth them: another law of the same effect leaves a rest, too
-    tied += [entry for entry in entries if entry not in tied and _suffices(entry, tied, none, thresholds)]
+    tied = contenders(entries, none, thresholds)
     tied = [entry for entry in tied if explains(entry, none, thresholds) and is_worth(entry, entries, none, thresholds)]
     tied = tied or _find_chief(entries, none, thresholds)
     if not tied:
@@ -269,6 +268,13 @@ def decide(
 def may_be_named(entry: Entry, entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:
     """Whether a candidate ties for the best of `entries`, which comes first, or is a part of one that does."""
     return any(set(entry.names) <= set(other.names) for other in _tied(entries, none, thresholds))
+
+
+def contenders(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> list[Entry]:
+    """What ties for the best, which comes first, and smaller sets that explain as much as it does."""
+    tied = _tied(entries, none, thresholds)
+    # what more effects explain has to be worth them: another law of the same effect leaves a rest, too
+    return tied + [entry for entry in entries if entry not in tied and _suffices(entry, tied, none, thresholds)]
 
 
 def _tied(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> list[Entry]:

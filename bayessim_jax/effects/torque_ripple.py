@@ -12,9 +12,15 @@ from bayessim_jax.effects.places import joints
 
 __all__ = ["TorqueRipple"]
 
+LEAST = 1.8
+"""Cycles per turn, or in the range of a slide."""
+
 
 class TorqueRipple(ForceEffect):
-    """τ = A sin(n q + φ), A in N m or N, n in cycles per turn (per 2π m of a slide), φ in rad."""
+    """τ = A sin(n q + φ), A in N m or N, n in cycles per turn (per 2π m of a slide), φ in rad.
+
+    From nearly two cycles per turn: what comes and goes once in a turn is weight that is elsewhere, and is called so.
+    """
 
     name = "torque_ripple"
 
@@ -28,7 +34,7 @@ class TorqueRipple(ForceEffect):
         force = scales.force
         return (
             EffectParameter("amplitude", scales.force_unit, 0.0, force, 0.0, 0.1 * force),
-            EffectParameter("cycles", "", turns, 100.0 * turns, 6.0 * turns, 6.0 * turns, log=True, scan=20),
+            EffectParameter("cycles", "", LEAST * turns, 100.0 * turns, 6.0 * turns, 6.0 * turns, log=True, scan=20),
             EffectParameter("phase", "rad", -1.5 * math.pi, 1.5 * math.pi, 0.0, 0.0, scan=3),
         )
 
