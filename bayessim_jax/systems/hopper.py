@@ -192,12 +192,13 @@ def _load() -> Any:
     with _quiet(), jax.ensure_compile_time_eval():
         mjcf: Any = importlib.import_module("brax.io.mjcf")
         model = mjcf.load(str(Path(found.origin).parent / "envs" / "assets" / "hopper.xml"))
-        # MuJoCo's contacts act within a margin, Brax's where geoms overlap: the floor, geom 0, is raised by it
+        # MuJoCo's contacts act within a margin, Brax's where geoms overlap: floor, geom 0, and leg grow by half of it each
         data = mujoco.MjData(model.mj_model)
         data.qpos[1] = -0.2
         mujoco.mj_forward(model.mj_model, data)
-        margin = float(data.contact.includemargin.max())
-        return model.replace(geom_pos=jnp.asarray(model.geom_pos).at[0, 2].add(margin))
+        half = 0.5 * float(data.contact.includemargin.max())
+        places, sizes = jnp.asarray(model.geom_pos), jnp.asarray(model.geom_size)
+        return model.replace(geom_pos=places.at[0, 2].add(half), geom_size=sizes.at[1:, 0].add(half))
 
 
 @contextlib.contextmanager
