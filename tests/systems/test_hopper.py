@@ -1,4 +1,4 @@
-"""Brax's hopper is MuJoCo's but for what the integrators make of a step."""
+"""Brax's hopper, contacts solved to the end, is MuJoCo's."""
 
 import importlib.util
 import sys
@@ -7,6 +7,7 @@ from pathlib import Path
 import gymnasium
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -16,14 +17,13 @@ from bayessim_jax.inference.strangeness import STRANGE, strangeness
 from bayessim_jax.learning import default_learner
 from bayessim_jax.rollout import rollout
 from bayessim_jax.systems import Hop, Hopper, hopper
-from bayessim_jax.systems.converged import solve_complementarity
+from bayessim_jax.systems.converged import solve_constraints
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
 from hopper_gap import RATIOS, compare, follow, record
 
 
 def test_in_the_air_one_step_is_gymnasiums():
-    """Without contact only the integrators differ: semi-implicit Euler here, Runge-Kutta there."""
     env_id, configure, _ = GYMNASIUM["hopper"]
     env = gymnasium.make(env_id, disable_env_checker=True).unwrapped
     system, task, rng = Hopper.create(noise=0.0), Hop(), np.random.default_rng(0)
@@ -45,18 +45,18 @@ def test_in_the_air_one_step_is_gymnasiums():
         before, later, reward = step(*floats)
         np.testing.assert_allclose(before, env._get_obs(), atol=1e-6)
         theirs, paid, *_ = env.step(action)
-        np.testing.assert_allclose(later[:5], theirs[:5], atol=2e-3)
-        np.testing.assert_allclose(later[5:], theirs[5:], atol=0.05)
-        assert float(reward) == pytest.approx(paid, abs=0.05)
+        np.testing.assert_allclose(later, theirs, atol=1e-5)
+        assert float(reward) == pytest.approx(paid, abs=1e-4)
 
 
 def test_the_gap_between_the_engines_is_as_stated():
     gaps, rewards, same_end = compare(Hopper.create(noise=0.0), *record(30, 15, 0))
-    assert np.median(gaps[:, 0, :5], 0).max() < 2e-3
-    assert np.median(gaps[:, 0, 5:], 0).max() < 1e-2
-    assert np.median(gaps[:, 14, 5:], 0).max() < 0.06
-    assert np.median(rewards) < 0.02
-    assert same_end.mean() > 0.9
+    """What is left is single precision, and contacts of links that Brax's model has none for."""
+    assert np.median(gaps[:, 0], 0).max() < 1e-5
+    assert np.median(gaps[:, 14], 0).max() < 1e-4
+    assert np.quantile(gaps[:, 14].max(-1), 0.8) < 1e-3
+    assert np.median(rewards) < 1e-3
+    assert same_end.all()
 
 
 def test_on_mujoco_it_is_the_environment():
@@ -70,7 +70,7 @@ def test_on_mujoco_it_is_the_environment():
 def test_friction_that_follows_the_environment_is_the_environments():
     """With Brax's own solver a sliding foot needs more than half as much again."""
     errors = follow(Hopper.create(noise=0.0), *record(30, 15, 0, speed=1.0))
-    assert 0.9 < RATIOS[errors.sum(0).argmin()] < 1.1
+    np.testing.assert_allclose(RATIOS[errors.argmin(1)], 1.0, atol=0.01)
 
 
 @pytest.mark.slow
@@ -104,34 +104,40 @@ def test_brax_as_it_comes_is_strange_and_the_targets_engine_is_not():
     assert np.min(found["generalized"]) > 2 * STRANGE
 
 
-def test_forces_are_complementary():
-    """Against the conditions themselves, for contacts that press, slide and part, and one that is not there."""
+def test_forces_of_constraints_are_those_of_the_accelerations():
+    """M a = τ + Jᵀ f with f = max(0, a_ref − J a) / R: rows that push, rows that part, and one that is not there."""
     rng = np.random.default_rng(0)
-    for _ in range(20):
-        jacobian = rng.normal(size=(8, 5))
-        a = jacobian @ jacobian.T + 0.3 * np.eye(8)
-        b = rng.normal(size=8)
-        a[3], a[:, 3], b[3] = 0.0, 0.0, 0.0
-        f = np.asarray(solve_complementarity(jnp.asarray(a), jnp.asarray(b), sweeps=300))
-        slack = a @ f + b
-        assert f.min() >= 0.0
-        assert f[3] == 0.0
-        assert slack.min() > -1e-4
-        np.testing.assert_allclose(f * slack, 0.0, atol=1e-4)
+    with jax.enable_x64():
+        for _ in range(20):
+            root, jacobian = rng.normal(size=(5, 5)), rng.normal(size=(8, 5))
+            mass, force, wanted = root @ root.T + 0.3 * np.eye(5), rng.normal(size=5), rng.normal(size=8)
+            compliance = rng.uniform(0.05, 0.5, 8)
+            jacobian[3], compliance[3], wanted[3] = 0.0, 0.0, 0.0
+            a = np.asarray(solve_constraints(*map(jnp.asarray, (mass, force, jacobian, compliance, wanted))))
+            f = np.maximum(wanted - jacobian @ a, 0.0) / np.where(compliance > 0, compliance, np.inf)
+            assert 0 < (f > 0).sum() < 8
+            np.testing.assert_allclose(mass @ a, force + jacobian.T @ f, atol=1e-9)
 
 
-def test_friction_stops_a_sliding_foot():
+def test_friction_slows_a_sliding_machine():
     system = Hopper.create(noise=0.0)
     qvel = jnp.zeros(6).at[0].set(1.0)
 
-    def speed(friction):
+    def slide(friction):
         theta = friction[None]
         state = system.begin(theta, jnp.zeros(6).at[1].set(1.25), qvel)
         step = lambda state, _: (system.step(theta, state, jnp.zeros(3)), None)  # noqa: E731
-        return jax.lax.scan(step, state, None, length=12)[0].physics.xd.vel[3, 0]
+        last = jax.lax.scan(step, state, None, length=12)[0]
+        return last.qpos, last.qvel
 
-    slow = jax.jit(jax.vmap(speed))(jnp.array([0.1, 0.3, 0.5]))
-    assert (np.diff(slow) < -1e-3).all()
+    data = mujoco.MjData(system.model)
+    speeds = []
+    for qpos, rates in zip(*jax.jit(jax.vmap(slide))(jnp.array([0.1, 0.3, 0.5])), strict=True):
+        data.qpos, data.qvel = qpos, rates
+        mujoco.mj_forward(system.model, data)
+        mujoco.mj_subtreeVel(system.model, data)
+        speeds.append(data.subtree_linvel[0, 0])
+    assert (np.diff(speeds) < -0.02).all()
 
 
 def test_falling_ends_the_task():
