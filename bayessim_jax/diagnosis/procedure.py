@@ -33,6 +33,7 @@ from bayessim_jax.diagnosis.verdict import (
     decide,
     error_left,
     explains,
+    find_shortsighted,
     has_special_case,
     is_worth,
     may_be_named,
@@ -72,6 +73,8 @@ WIDEST = 4
 """Effects of a set."""
 SIMPLE, AGAIN = 2, 4
 """Parameters of a candidate that is simulated from one point only, and how many others, and rivals, are from more."""
+RIVALS = 6
+"""Candidates that explain the misfit, too, whose predictions ahead are looked at where those of the best are bad."""
 SHORT = 0.01
 """Share of the misfit that a candidate leaves in simulation beyond what it does along the motion, from where on it is
 simulated from more points."""
@@ -622,7 +625,7 @@ def _finish(
     values, too: where joints stick and slip, what fits there may be far from what fits in simulation. Rivals of the
     best and parts of it are fitted from its numbers, and where one of them is then the best or ties with it, so are its
     own: none must win by a better start. Special cases and twins of the effects of what may be the answer are tried
-    in their places. What was fitted before is taken as it was.
+    in their places. What was fitted before is taken as it was, and what turns out to be shortsighted is left out.
     """
     bench, before = work.bench, dict(work.done)
     work.say(f"simulating {sum(c.candidate not in before for c in candidates)} candidates; compiling takes a while")
@@ -687,12 +690,36 @@ def _finish(
                 break
     work.done |= {entry.candidate: entry for entry in entries}
     if ahead is not None and entries:
-        _look_ahead(bench, none, [e for e in entries if may_be_named(e, entries, none, thresholds)], ahead)
+        for entry in _look_ahead(bench, none, entries, ahead, thresholds):
+            work.say(f"{entry.title}: predicts far ahead much worse than others")
+            entries.remove(entry)
     return entries
 
 
-def _look_ahead(bench: Bench, none: Entry, entries: Sequence[Entry], ahead: Shots) -> None:
-    """How far every candidate predicts long windows better than the simulator without effects.
+def _look_ahead(
+    bench: Bench, none: Entry, entries: Sequence[Entry], ahead: Shots, thresholds: Thresholds
+) -> list[Entry]:
+    """How far candidates that may be named predict long windows better than the simulator without effects.
+
+    Where the best does badly, what explains the misfit beside it is looked at, too. Returns who is shortsighted.
+    """
+    gone: list[Entry] = []
+    for _ in range(TURNS):
+        left = [entry for entry in entries if entry not in gone]
+        _foresee(bench, none, [e for e in left if may_be_named(e, left, none, thresholds)], ahead)
+        if not left[0].ahead > thresholds.lacking:
+            break
+        unseen = [e for e in left if np.isnan(e.ahead) and share_left(e.misfit, none.misfit) <= thresholds.left]
+        _foresee(bench, none, [left[0], *unseen[:RIVALS]], ahead)
+        found = find_shortsighted(left, none, thresholds)
+        gone += found
+        if not found:
+            break
+    return gone
+
+
+def _foresee(bench: Bench, none: Entry, entries: Sequence[Entry], ahead: Shots) -> None:
+    """Predict long windows with candidates of which the first is the best.
 
     Initial states are off by what the best candidate's fit moved them.
     """

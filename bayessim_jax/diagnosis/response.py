@@ -384,16 +384,20 @@ def cross_validate(
 ) -> Float[Array, " windows"]:
     """Log predictive density of every window by fits without the windows of its fold, linear around one fit to all.
 
-    Noise is that of the training windows; a window's own initial state, δ/S = `scaled` in the fit, is profiled out.
+    Noise is that of the training windows; a window's own initial state, δ/S = `scaled` in the fit, is integrated out:
+    who remembers more of it has to be right for more of it. With J = ∂r/∂(δ/S) and H = I + Jᵀ J at the best δ,
+
+        log p(y) = log N(y; ŷ(δ), σ²) − ½ |δ/S|² − ½ log det H.
     """
     k, n = p.size, scaled.shape[-1]
     flat = r.reshape(len(r), -1)
     free_all = jnp.concatenate([free, jnp.ones(n, bool)])
     slopes = jnp.where(free_all[:, None], slopes, 0.0)
+    own = jnp.einsum("wik,wjk->wij", slopes[:, k:], slopes[:, k:]) + jnp.eye(n)
+    width = 0.5 * jnp.linalg.slogdet(own)[1]
 
     def fit(weight: Array) -> tuple[Array, Array]:
-        """The move of p by windows of some weight, and what is then left of every window with its own best state."""
-        own = jnp.einsum("wik,wjk->wij", slopes[:, k:], slopes[:, k:]) + jnp.eye(n)
+        """Of the fit to windows of some weight, what is left of every window at its own best state, and that δ/S."""
         cross = jnp.einsum("wik,wjk->wij", slopes[:, k:], slopes[:, :k])
         pull = jnp.einsum("wik,wk->wi", slopes, flat).at[:, k:].add(-scaled)
         toward = jnp.linalg.solve(own, jnp.concatenate([cross, pull[:, k:, None]], -1))
@@ -407,16 +411,16 @@ def cross_validate(
         move = move / jnp.maximum(jnp.abs(move).max(initial=0.0), 1.0)
         state = toward[..., k] - toward[..., :k] @ move
         left = flat - jnp.einsum("wik,i->wk", slopes[:, :k], move) - jnp.einsum("wik,wi->wk", slopes[:, k:], state)
-        return move, left.reshape(r.shape)
+        return left.reshape(r.shape), scaled + state
 
     def one(out: Array) -> Array:
         weight = jnp.where(out.all(), 1.0, 1.0 - out)
-        left = fit(weight)[1]
+        left, state = fit(weight)
         counts = jnp.einsum("w,wro->o", weight, measured.astype(flat.dtype))
         share = jnp.maximum(1.0 - (k + n * weight.sum()) / jnp.maximum(counts.sum(), 1.0), 0.2)
         ratio = jnp.sqrt(jnp.einsum("w,wro->o", weight, left**2) / jnp.maximum(counts * share, 1.0))
         ratio = jnp.maximum(ratio, floor / sigma)
         logs = jnp.where(measured, -0.5 * (left / ratio) ** 2 - jnp.log(ratio * sigma), 0.0)
-        return jnp.where(out, logs.sum((1, 2)), 0.0)
+        return jnp.where(out, logs.sum((1, 2)) - 0.5 * (state**2).sum(-1) - width, 0.0)
 
     return jax.vmap(one)(folds).sum(0)

@@ -26,6 +26,7 @@ __all__ = [
     "error_left",
     "explains",
     "falls_short",
+    "find_shortsighted",
     "has_special_case",
     "is_outdone",
     "is_worth",
@@ -94,6 +95,8 @@ class Thresholds:
     """Share of the error of predictions ahead, above which they are tried, too."""
     lacking: float = 0.05
     """Share of it, above which two effects or more are tried with another one."""
+    farther: float = 0.1
+    """Times the error of predictions ahead of a candidate that another one has, which makes it shortsighted."""
     worth: float = 0.4
     """Share of what fewer effects leave, below which more effects are worth it."""
     tie: float = 2.0
@@ -346,6 +349,20 @@ def falls_short(baseline: float, answer: float, floor: float, thresholds: Thresh
     """Whether an answer leaves much of the error on recordings left out; errors as `nrmse`, `floor` of noise alone."""
     left = max(answer**2 - floor**2, 0.0) / max(baseline**2 - floor**2, 1e-12)
     return answer > thresholds.visible * floor and left > thresholds.held
+
+
+def find_shortsighted(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> list[Entry]:
+    """Candidates that predict far ahead much worse than another one with as few effects that explains pieces, too.
+
+    What bends to what short pieces show, whatever makes it, is found out by what it says of the time after.
+    """
+    sound = [entry for entry in entries if share_left(entry.misfit, none.misfit) <= thresholds.left]
+    return [
+        entry
+        for entry in entries
+        if entry.ahead > thresholds.lacking
+        and any(o.ahead <= thresholds.farther * entry.ahead and len(o.names) <= len(entry.names) for o in sound)
+    ]
 
 
 def _suffices(entry: Entry, tied: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:

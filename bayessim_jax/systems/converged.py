@@ -71,12 +71,12 @@ def solve_constraints(
     """
     stiffness = jnp.where(compliance > 0.0, 1.0 / jnp.where(compliance > 0.0, compliance, 1.0), 0.0)
 
-    def newton(a: Array, _: None) -> tuple[Array, None]:
-        pushes = jnp.where(jacobian @ a < wanted, stiffness, 0.0)
+    def newton(pushes: Array, _: None) -> tuple[Array, Array]:
         weighed = jacobian.T * pushes
-        return _solve(mass + weighed @ jacobian, force + weighed @ wanted), None
+        a = _solve(mass + weighed @ jacobian, force + weighed @ wanted)
+        return jnp.where(jacobian @ a < wanted, stiffness, 0.0), a
 
-    return jax.lax.scan(newton, _solve(mass, force), None, length=steps)[0]
+    return jax.lax.scan(newton, jnp.zeros_like(wanted), None, length=1 + steps)[1][-1]
 
 
 def _solve(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -192,7 +192,7 @@ def _load() -> Any:
     with _quiet(), jax.ensure_compile_time_eval():
         mjcf: Any = importlib.import_module("brax.io.mjcf")
         model = mjcf.load(str(Path(found.origin).parent / "envs" / "assets" / "hopper.xml"))
-        # MuJoCo's contacts act within a margin, Brax's where geoms overlap: floor, geom 0, and leg grow by half of it each
+        # MuJoCo's contacts act within a margin, Brax's where geoms overlap: floor, geom 0, and links grow by half of it
         data = mujoco.MjData(model.mj_model)
         data.qpos[1] = -0.2
         mujoco.mj_forward(model.mj_model, data)
