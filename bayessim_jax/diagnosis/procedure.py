@@ -580,17 +580,13 @@ def _are_rivals(entry: Entry, best: Entry, none: Entry, thresholds: Thresholds) 
 
 
 def _stand_ins(bench: Bench, candidate: Candidate) -> list[Candidate]:
-    """Sets with one effect replaced by a special case or a twin of it, as far as there is room for their parameters.
-
-    Twins of single effects are finalists anyway.
-    """
-    stands_for = can_stand_for if len(candidate.effects) > 1 else lambda one, other: contains(other, one)
+    """Sets with one effect replaced by a special case or a twin of it, as far as there is room for their parameters."""
     seats = [bench.seats(Candidate((k,))).get(bench.name(k), bench.name(k)) for k in range(len(bench.pairs))]
     found = [
         Candidate(tuple(sorted({*candidate.effects, k} - {effect})))
         for effect in candidate.effects
         for k in range(len(bench.pairs))
-        if k not in candidate.effects and stands_for(seats[k], seats[effect])
+        if k not in candidate.effects and can_stand_for(seats[k], seats[effect])
     ]
     return [each for each in found if len(bench.columns(each)) <= bench.slots]
 
