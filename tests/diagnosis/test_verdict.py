@@ -12,6 +12,7 @@ from bayessim_jax.diagnosis.verdict import (
     decide,
     error_left,
     falls_short,
+    find_shortsighted,
     is_outdone,
     may_be_named,
 )
@@ -44,6 +45,23 @@ def test_one_candidate_that_explains_is_named():
     assert found.verdict == "explained"
     assert found.best.names == ["a@x"]
     assert 0.9 < found.probabilities[0] < 1.0
+
+
+@pytest.mark.parametrize(
+    ("ahead", "other", "left", "names", "gone"),
+    [
+        (0.2, 0.01, 0.01, ["b@x"], True),
+        (0.2, 0.05, 0.01, ["b@x"], False),  # not ten times better
+        (0.02, 0.001, 0.01, ["b@x"], False),  # the best is good enough
+        (0.2, 0.01, 0.4, ["b@x"], False),  # the other explains no pieces
+        (0.2, 0.01, 0.01, ["b@x", "c@x"], False),  # more effects
+        (0.2, float("nan"), 0.01, ["b@x"], False),  # not looked at
+    ],
+)
+def test_what_predicts_far_ahead_much_worse_than_another_is_shortsighted(ahead, other, left, names, gone):
+    best, rival = entry(["a@x"], 100.0, 0.002), entry(names, 90.0, left, seed=1)
+    best.ahead, rival.ahead = ahead, other
+    assert find_shortsighted([best, rival], entry([], 0.0, 1.0), Thresholds()) == ([best] if gone else [])
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 from bayessim_jax.cli.main import main
 from bayessim_jax.recordings.concealing import SEALED, AbsorbedError, conceal
 from bayessim_jax.recordings.loading import load_case
-from benchmarks.concealed import GROUPS, draw_cases, judge, summarize
+from benchmarks.concealed import GROUPS, ONE_LAW, draw_cases, judge, summarize
 from benchmarks.worlds import MODELS, RIGS
 
 QUICK = {"recordings": 2, "seconds": 1.5}
@@ -185,6 +185,8 @@ def test_drawn_cases_hold_every_group_and_every_effect():
     assert all(len(c["effects"]) == 2 for c in cases if c["group"] == "pair")
     assert all((0.02 <= c["strength"] <= 0.1) == (c["group"] == "weak") for c in cases if c["strength"] != 0.1)
     assert cases == draw_cases(list(MODELS), 240, 1)
+    pairs = [set(case["effects"]) for case in cases if case["group"] == "pair"]
+    assert pairs and not any(pair <= law for pair in pairs for law in ONE_LAW)
 
 
 def test_verdicts_are_judged_by_what_is_sealed():
@@ -200,6 +202,7 @@ def test_verdicts_are_judged_by_what_is_sealed():
     assert judge(hidden, table("explained", tilt))["outcome"] == "named"
     assert judge(friction, table("explained", right))["outcome"] == "named"
     assert judge(friction, table("ambiguous", tilt, right))["outcome"] == "among"
+    assert judge(friction, table("ambiguous", tilt, right, ["a@x"], ["b@x"]))["outcome"] == "crowd"
     assert not judge(friction, table("ambiguous", tilt, right))["single_best"]
     assert judge(friction, table("explained", tilt))["outcome"] == "wrong"
     assert judge(friction, table("unexplained"))["outcome"] == "refused"
