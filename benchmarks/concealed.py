@@ -37,7 +37,9 @@ __all__ = [
 
 GROUPS = {"single": 0.37, "weak": 0.1, "pair": 0.1, "unknown": 0.18, "clean": 0.25}
 """Shares of the cases: one effect, one weak effect, two, one of no library, none."""
-STRENGTHS = {"weak": (0.02, 0.1)}
+STRONG = 0.1
+"""Least strength, but of weak effects."""
+STRENGTHS = {"weak": (0.02, STRONG)}
 """Log-uniform between these; of all other groups between 0.1 and 0.6."""
 NOISE = (0.3, 1.0, 3.0)
 ONE_LAW = (
@@ -87,7 +89,7 @@ def draw_cases(rigs: list[str], count: int, seed: int, finer: int = FINER) -> li
             one = set().union(*(law for law in ONE_LAW if effects[0] in law))
             second = [name for name in library if name not in {effects[0], *one} and _fits([name], rig)]
             effects.append(str(rng.choice(second)))
-        low, high = STRENGTHS.get(group, (0.1, 0.6))
+        low, high = STRENGTHS.get(group, (STRONG, 0.6))
         cases.append(
             {
                 "rig": rig,
@@ -121,7 +123,7 @@ def make_drawn(folder: Path, case: dict[str, Any]) -> dict[str, Any]:
                 return make_case(folder, case["rig"], case["effects"], strength=asked, seed=seed, **settings)
             except StrengthError as error:
                 told, asked = error, 0.9 * error.most
-                if asked < (0.02 if case["group"] == "weak" else 0.1):
+                if asked < STRENGTHS.get(case["group"], (STRONG,))[0]:
                     break
             except AbsorbedError as error:
                 told = error
@@ -304,6 +306,14 @@ def summarize(rows: list[dict[str, Any]]) -> str:
             parts.append(f"joint right {sum(located)} of {len(located)}")
         parts.append(f"library without abstention: wrong in {sum(_is_wrong(row) for row in members)}")
         lines.append(f"{group:<8} {len(members):>4}: {', '.join(parts)}")
+    for group in ("single", "pair"):
+        seen = [row for row in rows if row["case"]["group"] == group and _is_seen(row)]
+        if seen:
+            told = sum(row["outcome"] in ("named", "among") for row in seen)
+            lines.append(
+                f"{group}s that lack {STRONG} with the best values of what is unknown, too: "
+                f"{told} of {len(seen)} told ({told / len(seen):.0%})"
+            )
     missed = [row for row in rows if row["outcome"] == "missed"]
     known = [row["sealed"]["lacks"]["with_best"] < NOTHING for row in missed if "lacks" in row["sealed"]]
     if any(known):
@@ -325,6 +335,11 @@ def summarize(rows: list[dict[str, Any]]) -> str:
     if len(seconds):
         lines.append(f"seconds per case: median {np.median(seconds):.0f}, longest {seconds.max():.0f}")
     return "\n".join(lines)
+
+
+def _is_seen(row: dict[str, Any]) -> bool:
+    """Whether the model with the best values of what is unknown lacks as much as a strong effect; as far as known."""
+    return bool(row["sealed"].get("lacks", {}).get("with_best", 0.0) >= STRONG)
 
 
 def _is_wrong(row: dict[str, Any]) -> bool:

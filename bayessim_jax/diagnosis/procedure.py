@@ -82,6 +82,8 @@ HOPELESS = 0.25
 """Share that it leaves along the motion, from where on it is not, if another one explains the misfit."""
 TURNS = 3
 """How often rivals are fitted from the best one's numbers, where one of them then is the best."""
+GENERAL = 8
+"""Pairs that are begun from the numbers of a special case of them."""
 KIN = 2
 """Relatives of the best pair's members, of which partners are looked for as well."""
 WORTH = 0.5
@@ -228,7 +230,7 @@ def name_effects(
     # where nothing is predicted ahead, what shows in the windows themselves is all that tells of another effect
     shows = explained and problem.ahead is None and entries[0].misfit.p_value < FALSE_ALARMS
     doubtful = explained and (entries[0].ahead > thresholds.doubtful or _is_cornered(entries[0], screen.d))
-    if left > thresholds.enough or not explained or shows or doubtful:
+    if left > thresholds.enough or not explained or shows or doubtful or _leaves_a_rest(entries[0], left, thresholds):
         say("one effect is not enough: trying pairs")
         worth = thresholds.worth * remain(ranked[0]) if explained else np.inf
         growth = _Growth(screens, begun)
@@ -257,6 +259,11 @@ def name_effects(
                 say("trying what is left without each of its effects")
                 entries = finish([*spared, *kept])
     return decide(work.bench, none, entries, work.group, thresholds, listed)
+
+
+def _leaves_a_rest(entry: Entry, left: float, thresholds: Thresholds) -> bool:
+    """Whether more shows of what a candidate leaves than the form of its law, in pieces or ahead."""
+    return entry.misfit.p_value < FALSE_ALARMS and (left > thresholds.rest or entry.ahead > thresholds.rest_ahead)
 
 
 def _is_cornered(entry: Entry, d: int) -> bool:
@@ -520,7 +527,38 @@ def _pair(key: PRNGKeyArray, growth: _Growth, nothing: Screened, ranked: Sequenc
         kin = [each for each in ranked if any(are_kin(first.name(each.candidate), name) for name in names)]
         for known in [each for each in kin if each.candidate not in [*led, *members]][:KIN]:
             found += growth.extend(known)
-    return sorted(found, key=lambda item: -item.score)
+        found += _with_general_laws(growth.screens, sorted(found, key=lambda item: -item.score))
+    # of those that were begun twice the better one
+    return sorted({each.candidate: each for each in sorted(found, key=_score)}.values(), key=_score, reverse=True)
+
+
+def _with_general_laws(screens: Sequence[Screen], ranked: Sequence[Screened]) -> list[Screened]:
+    """The best pairs with an effect that has one of theirs as a special case in its place, begun from their numbers.
+
+    As far as that explained less before: a general law beside another effect may be stuck, or have looked worse than
+    others when candidates were glanced at.
+    """
+    first, tried = screens[0], {each.candidate: each.score for each in ranked}
+    begin: dict[Candidate, tuple[Screened, int]] = {}
+    for pair in ranked:
+        for s in pair.candidate.effects:
+            for k in range(len(first.pairs)):
+                wider = Candidate(tuple(sorted({*pair.candidate.effects, k} - {s})))
+                stuck = tried.get(wider, -np.inf) < pair.score and len(wider.effects) == len(pair.candidate.effects)
+                if stuck and wider not in begin and _is_special_case(first, s, k) and first.takes(wider):
+                    begin[wider] = pair, s
+
+    def finish(screen: Screen, item: tuple[Candidate, tuple[Screened, int]]) -> Screened | None:
+        wider, (pair, s) = item
+        rest = screen.part(pair, tuple(k for k in pair.candidate.effects if k != s))
+        begun = screen.begin_from(wider, pair, rest)
+        return begun and screen.finish_candidate(begun, rest)
+
+    return [each for each in _each(screens, list(begin.items())[:GENERAL], finish) if each is not None]
+
+
+def _score(found: Screened) -> float:
+    return found.score
 
 
 def _varied(ranked: Sequence[Screened], least: float) -> list[Screened]:

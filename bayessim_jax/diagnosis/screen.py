@@ -213,22 +213,26 @@ class Screen:
     def begin_from(self, candidate: Candidate, simpler: Screened, known: Screened) -> Begun | None:
         """Take all steps before the last ones with an effect from the numbers of a special case of it.
 
-        Parameters of the same unit have its number; the others are where they are begun from.
+        Parameters of the same unit have its number; the others are where they are begun from, and what both have
+        besides, as in `known`, is as it is there.
         """
         self.scene.begin_around(known.candidate, known.p)
-        ((k, place),), ((s, held),) = self.offsets(candidate), self.offsets(simpler.candidate)
+        own, held = dict(self.offsets(candidate)), dict(self.offsets(simpler.candidate))
+        (k,), (s,) = own.keys() - held.keys(), held.keys() - own.keys()
         parameters, margin = self.scene.parameters, self.scene.margin
-        numbers = zip(parameters[s], margin[s], simpler.p[held], strict=True)
+        numbers = zip(parameters[s], margin[s], simpler.p[held[s]], strict=True)
         values = {p.unit: float(m.value(float(z))) for p, m, z in numbers}
         ends = {}
-        for start in self.starts(candidate):
+        for start in self.starts(Candidate((k,))):
             p = np.zeros(self.d + self.slots)
-            p[: self.d], p[place] = simpler.p[: self.d], start
-            for i, (parameter, own) in enumerate(zip(parameters[k], margin[k], strict=True)):
+            p[: self.d], p[own[k]] = simpler.p[: self.d], start
+            for other in own.keys() & held.keys():
+                p[own[other]] = simpler.p[held[other]]
+            for i, (parameter, range_) in enumerate(zip(parameters[k], margin[k], strict=True)):
                 if parameter.unit in values:
                     inside = EDGE * (parameter.high - parameter.low)
                     value = np.clip(values[parameter.unit], parameter.low + inside, parameter.high - inside)
-                    p[place.start + i] = own.standard(float(value))
+                    p[own[k].start + i] = range_.standard(float(value))
             ends[p.tobytes()] = (p, simpler.delta)
         return self._race(candidate, known, list(ends.values()), RACES)
 

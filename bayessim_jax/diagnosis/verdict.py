@@ -91,6 +91,10 @@ class Thresholds:
     """The same for one effect by which all but a rest is foreseen, that no set of candidates explains."""
     enough: float = 0.015
     """Share that effects may leave before larger sets are tried."""
+    rest: float = 0.002
+    """The same for one effect, where what it leaves shows."""
+    rest_ahead: float = 0.02
+    """Share of the error of predictions ahead, above which pairs are tried, too, where what is left shows."""
     doubtful: float = 0.1
     """Share of the error of predictions ahead, above which they are tried, too."""
     lacking: float = 0.05
