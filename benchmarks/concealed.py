@@ -44,13 +44,13 @@ STRENGTHS = {"weak": (0.02, STRONG)}
 NOISE = (0.3, 1.0, 3.0)
 ONE_LAW = (
     {"coulomb_friction", "stribeck_friction"},
-    {"coulomb_friction", "asymmetric_friction"},
+    {"coulomb_friction", "asymmetric_friction", "actuator_bias"},
     {"coulomb_friction", "load_dependent_friction"},
     {"viscous_friction", "back_emf"},
     {"base_tilt", "sensor_offset", "link_offset"},
     {"armature", "payload", "link_offset"},
 )
-"""Effects of which two at one joint are one of them with other numbers: no pairs."""
+"""Effects of which two at one joint are one of them, or a third, with other numbers: no pairs."""
 ATTEMPTS = 5
 FINER = 4
 """Times that machines take shorter time steps than `bayessim conceal` does: 1/16 of the model's own."""
