@@ -230,7 +230,7 @@ def name_effects(
     # where nothing is predicted ahead, what shows in the windows themselves is all that tells of another effect
     shows = explained and problem.ahead is None and entries[0].misfit.p_value < FALSE_ALARMS
     doubtful = explained and (entries[0].ahead > thresholds.doubtful or _is_cornered(entries[0], screen.d))
-    if left > thresholds.enough or not explained or shows or doubtful or _leaves_a_rest(entries[0], left, thresholds):
+    if left > thresholds.enough or not explained or shows or doubtful or _leave_a_rest(entries, none, thresholds):
         say("one effect is not enough: trying pairs")
         worth = thresholds.worth * remain(ranked[0]) if explained else np.inf
         growth = _Growth(screens, begun)
@@ -261,9 +261,13 @@ def name_effects(
     return decide(work.bench, none, entries, work.group, thresholds, listed)
 
 
-def _leaves_a_rest(entry: Entry, left: float, thresholds: Thresholds) -> bool:
-    """Whether more shows of what a candidate leaves than the form of its law, in pieces or ahead."""
-    return entry.misfit.p_value < FALSE_ALARMS and (left > thresholds.rest or entry.ahead > thresholds.rest_ahead)
+def _leave_a_rest(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:
+    """Whether more shows of what every contender leaves than the form of its law, in pieces or ahead."""
+    return all(
+        entry.misfit.p_value < FALSE_ALARMS
+        and (share_left(entry.misfit, none.misfit) > thresholds.rest or entry.ahead > thresholds.rest_ahead)
+        for entry in contenders(entries, none, thresholds)
+    )
 
 
 def _is_cornered(entry: Entry, d: int) -> bool:
