@@ -39,8 +39,8 @@ GROUPS = {"single": 0.37, "weak": 0.1, "pair": 0.1, "unknown": 0.18, "clean": 0.
 """Shares of the cases: one effect, one weak effect, two, one of no library, none."""
 STRONG = 0.1
 """Least strength, but of weak effects."""
-STRENGTHS = {"weak": (0.02, STRONG)}
-"""Log-uniform between these; of all other groups between 0.1 and 0.6."""
+STRENGTHS = dict.fromkeys(GROUPS, (STRONG, 0.6)) | {"weak": (0.02, STRONG)}
+"""Log-uniform between these."""
 NOISE = (0.3, 1.0, 3.0)
 ONE_LAW = (
     {"coulomb_friction", "stribeck_friction"},
@@ -89,7 +89,7 @@ def draw_cases(rigs: list[str], count: int, seed: int, finer: int = FINER) -> li
             one = set().union(*(law for law in ONE_LAW if effects[0] in law))
             second = [name for name in library if name not in {effects[0], *one} and _fits([name], rig)]
             effects.append(str(rng.choice(second)))
-        low, high = STRENGTHS.get(group, (STRONG, 0.6))
+        low, high = STRENGTHS[group]
         cases.append(
             {
                 "rig": rig,
@@ -123,7 +123,7 @@ def make_drawn(folder: Path, case: dict[str, Any]) -> dict[str, Any]:
                 return make_case(folder, case["rig"], case["effects"], strength=asked, seed=seed, **settings)
             except StrengthError as error:
                 told, asked = error, 0.9 * error.most
-                if asked < STRENGTHS.get(case["group"], (STRONG,))[0]:
+                if asked < STRENGTHS[case["group"]][0]:
                     break
             except AbsorbedError as error:
                 told = error

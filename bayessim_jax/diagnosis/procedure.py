@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from itertools import count, islice
+from itertools import count, islice, product
 from typing import Any, TypeVar
 from zlib import crc32
 
@@ -531,7 +531,7 @@ def _pair(key: PRNGKeyArray, growth: _Growth, nothing: Screened, ranked: Sequenc
         kin = [each for each in ranked if any(are_kin(first.name(each.candidate), name) for name in names)]
         for known in [each for each in kin if each.candidate not in [*led, *members]][:KIN]:
             found += growth.extend(known)
-        found += _with_general_laws(growth.screens, sorted(found, key=lambda item: -item.score))
+        found += _with_general_laws(growth.screens, sorted(found, key=_score, reverse=True))
     # of those that were begun twice the better one
     return sorted({each.candidate: each for each in sorted(found, key=_score)}.values(), key=_score, reverse=True)
 
@@ -545,12 +545,13 @@ def _with_general_laws(screens: Sequence[Screen], ranked: Sequence[Screened]) ->
     first, tried = screens[0], {each.candidate: each.score for each in ranked}
     begin: dict[Candidate, tuple[Screened, int]] = {}
     for pair in ranked:
-        for s in pair.candidate.effects:
-            for k in range(len(first.pairs)):
-                wider = Candidate(tuple(sorted({*pair.candidate.effects, k} - {s})))
-                stuck = tried.get(wider, -np.inf) < pair.score and len(wider.effects) == len(pair.candidate.effects)
-                if stuck and wider not in begin and _is_special_case(first, s, k) and first.takes(wider):
-                    begin[wider] = pair, s
+        own = set(pair.candidate.effects)
+        for s, k in product(pair.candidate.effects, range(len(first.pairs))):
+            if k in own or not _is_special_case(first, s, k):
+                continue
+            wider = Candidate(tuple(sorted(own - {s} | {k})))
+            if wider not in begin and tried.get(wider, -np.inf) < pair.score and first.takes(wider):
+                begin[wider] = pair, s
 
     def finish(screen: Screen, item: tuple[Candidate, tuple[Screened, int]]) -> Screened | None:
         wider, (pair, s) = item
