@@ -22,6 +22,7 @@ from bayessim_jax.inference.shooting import Shots
 from bayessim_jax.recordings.priors import LogNormal, Normal, Prior
 from bayessim_jax.recordings.recording import CaseRecording, resample
 from bayessim_jax.recordings.smoothing import smooth_recordings
+from bayessim_jax.recordings.splitting import choose_held_out, describe_inputs
 from bayessim_jax.recordings.touching import drop_contacts
 from bayessim_jax.recordings.windows import Windows, stack_windows
 from bayessim_jax.systems.mjcf import MjcfSystem, Unknown, mjcf_system
@@ -339,17 +340,19 @@ def predictor(model: CaseModel) -> Replay:
 def split_windows(model: CaseModel, lead: float = 0.0) -> tuple[Windows, Windows]:
     """Windows to fit and windows to judge by: of whole recordings left out, or of every fourth window of the one.
 
-    About a quarter of the recordings is left out, spread over the list; those without a window count for neither.
-    The first `lead` seconds of each are left out, where that costs little (`find_windows`).
+    About a quarter of the recordings is left out, whose commands are like those of the others (`choose_held_out`);
+    those without a window count for neither. The first `lead` seconds of each are left out, where that costs little
+    (`find_windows`).
     """
     every = model.windows(range(len(model.recordings)), lead=lead)
-    present = sorted(set(every.recording.tolist()))
-    units = every.recording if len(present) > 1 else np.arange(len(every))
-    labels = sorted(set(units.tolist()))
-    if len(labels) < 2:
+    present = np.unique(every.recording)
+    if len(present) > 1:
+        chosen = choose_held_out(describe_inputs([model.recordings[i] for i in present]))
+        held = np.isin(every.recording, present[chosen])
+    elif len(every) < 2:
         return every, every
-    period = max(round(len(labels) / max(round(len(labels) / 4), 1)), 2)
-    held = np.isin(units, labels[period - 1 :: period])
+    else:
+        held = choose_held_out(np.zeros((len(every), 0)))
     return take(every, ~held), take(every, held)
 
 
