@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from bayessim_jax.diagnosis.bench import Bench, Candidate
 from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, Misfit
-from bayessim_jax.inference.scores import Errors
+from bayessim_jax.inference.scores import Errors, nrmse
 from bayessim_jax.inference.shooting import Fit, Shots
 
 __all__ = [
@@ -65,6 +65,8 @@ MIMICRY = 0.05
 """Chance that what looks like an effect is something else that is in no library."""
 VISIBLE = 0.5
 """Error of predictions over what cannot be predicted, from which a share of it says something."""
+SEVERAL = 4
+"""Windows left out, from which one of them alone takes no answer away."""
 BOOTSTRAPS, FEW = 1000, 6
 """Draws of the bootstrap; recordings, below which windows are drawn instead."""
 
@@ -349,10 +351,22 @@ def is_outdone(
     return bool(sure and was - now < thresholds.ceiling * (was - best))
 
 
-def falls_short(baseline: float, answer: float, floor: float, thresholds: Thresholds) -> bool:
-    """Whether an answer leaves much of the error on recordings left out; errors as `nrmse`, `floor` of noise alone."""
-    left = max(answer**2 - floor**2, 0.0) / max(baseline**2 - floor**2, 1e-12)
-    return answer > thresholds.visible * floor and left > thresholds.held
+def falls_short(
+    baseline: Errors, answer: Errors, scale: Float[np.ndarray, " obs"], floor: float, thresholds: Thresholds
+) -> bool:
+    """Whether an answer leaves much of the error on recordings left out; `floor` is the nrmse that noise alone leaves.
+
+    In more windows than one, where there are some: where motion passes by a saddle, the best simulator may go astray.
+    """
+
+    def does(windows: Bool[np.ndarray, " windows"]) -> bool:
+        was, now = (nrmse(Errors(e.error[windows], e.measured[windows]), scale) for e in (baseline, answer))
+        left = max(now**2 - floor**2, 0.0) / max(was**2 - floor**2, 1e-12)
+        return bool(now > thresholds.visible * floor and left > thresholds.held)
+
+    size = ((answer.error / scale) ** 2).sum((1, 2))
+    every = np.ones(len(size), bool)
+    return does(every) and (len(size) < SEVERAL or does(np.arange(len(size)) != np.argmax(size)))
 
 
 def find_shortsighted(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> list[Entry]:

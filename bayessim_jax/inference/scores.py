@@ -15,8 +15,10 @@ from bayessim_jax.programs import trace_once
 __all__ = [
     "Errors",
     "Score",
+    "channel_errors",
     "compare",
     "error_spread",
+    "nrmse",
     "predict_windows",
     "prediction_errors",
     "score",
@@ -96,6 +98,18 @@ def compare(
     return Errors(np.where(measured, y - np.nan_to_num(predicted), 0.0), measured, int(lost.sum()))
 
 
+def channel_errors(errors: Errors, scale: Float[np.ndarray, " obs"]) -> Float[np.ndarray, " obs"]:
+    """Root mean square errors over their channel's scale; not a number where nothing was measured."""
+    counts = errors.measured.sum((0, 1))
+    return np.where(counts > 0, np.sqrt((errors.error**2).sum((0, 1)) / np.maximum(counts, 1)) / scale, np.nan)
+
+
+def nrmse(errors: Errors, scale: Float[np.ndarray, " obs"]) -> float:
+    """Their average over the channels where something was measured; not a number if there is none."""
+    each = channel_errors(errors, scale)
+    return float(each[np.isfinite(each)].mean()) if np.isfinite(each).any() else float("nan")
+
+
 def error_spread(errors: Errors, scale: Float[np.ndarray, " obs"]) -> Float[np.ndarray, "bins obs"]:
     """Root mean square of errors over their channel's scale, for stretches of lead time; 1 where there are none."""
     spreads = []
@@ -120,15 +134,12 @@ def score(
 
     `scale` is the standard deviation of every channel.
     """
-    counts = errors.measured.sum((0, 1))
-    rms = np.sqrt((errors.error**2).sum((0, 1)) / np.maximum(counts, 1))
-    per_channel = {c: float(rms[k] / scale[k]) for k, c in enumerate(channels) if counts[k]}
+    per_channel = {c: float(e) for c, e in zip(channels, channel_errors(errors, scale), strict=True) if np.isfinite(e)}
     logs = 0.0
     for rows, sd in zip(_stretches(errors), spread, strict=True):
         z = errors.error[:, rows] / scale / sd
         logs += float(np.where(errors.measured[:, rows], -0.5 * z**2 - np.log(sd * np.sqrt(2 * np.pi)), 0.0).sum())
-    nrmse = float(np.mean(list(per_channel.values()))) if per_channel else float("nan")
-    return Score(nrmse, logs / max(int(counts.sum()), 1), per_channel, errors.diverged)
+    return Score(nrmse(errors, scale), logs / max(int(errors.measured.sum()), 1), per_channel, errors.diverged)
 
 
 def smallest_error(

@@ -307,7 +307,7 @@ def diagnose_case(
     floor = _floor(variance, scale, shots)
     if result.confusion:
         excused = _floor(variance + np.square(_beside(model, shots)), scale, shots)
-        if _is_refuted(judging, scores, excused, scale, thresholds or Thresholds()):
+        if _is_refuted(judging, excused, scale, thresholds or Thresholds()):
             result.take_back()
     named = result.verdict != "no_mismatch"
     return CaseDiagnosis(
@@ -336,11 +336,9 @@ def diagnose_case(
     )
 
 
-def _is_refuted(
-    judging: Mapping[str, Errors], scores: Mapping[str, Score], floor: float, scale: np.ndarray, thresholds: Thresholds
-) -> bool:
+def _is_refuted(judging: Mapping[str, Errors], floor: float, scale: np.ndarray, thresholds: Thresholds) -> bool:
     """Whether recordings left out contradict an answer."""
-    if falls_short(scores["baseline"].nrmse, scores["augmented"].nrmse, floor, thresholds):
+    if falls_short(judging["baseline"], judging["augmented"], scale, floor, thresholds):
         return True
     if "flexible" not in judging:
         return False

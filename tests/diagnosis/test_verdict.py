@@ -86,6 +86,11 @@ def test_an_answer_that_a_force_without_a_name_outdoes_is_taken_back(answer, fle
     assert found.verdict == "unexplained" and found.best.names == ["a@x"] and found.confusion == []
 
 
+def uniform_errors(size, windows=8):
+    errors = np.full((windows, 5, 2), 1.0 if np.isnan(size) else size)
+    return Errors(errors, np.full(errors.shape, np.isfinite(size)))
+
+
 @pytest.mark.parametrize(
     ("baseline", "answer", "floor", "wanted"),
     [
@@ -96,7 +101,14 @@ def test_an_answer_that_a_force_without_a_name_outdoes_is_taken_back(answer, fle
     ],
 )
 def test_an_answer_that_leaves_much_error_on_recordings_left_out_is_taken_back(baseline, answer, floor, wanted):
-    assert falls_short(baseline, answer, floor, Thresholds()) == wanted
+    assert falls_short(uniform_errors(baseline), uniform_errors(answer), np.ones(2), floor, Thresholds()) == wanted
+
+
+@pytest.mark.parametrize(("astray", "windows", "wanted"), [(1, 8, False), (2, 8, True), (1, 3, True)])
+def test_one_window_of_several_in_which_the_answer_goes_astray_takes_nothing_back(astray, windows, wanted):
+    answer = uniform_errors(0.02, windows)
+    answer.error[:astray] = 2.0
+    assert falls_short(uniform_errors(0.9, windows), answer, np.ones(2), 0.01, Thresholds()) == wanted
 
 
 def test_candidates_that_predict_alike_are_a_confusion_set():
