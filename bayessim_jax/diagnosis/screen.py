@@ -39,6 +39,9 @@ SCAN = ((2, False, 2),)
 """The same for a scan beside what is known."""
 LASTING = 8
 """Further steps of those that went on."""
+SHIFTS, HELD, MOVES, BETTER = np.delete(np.arange(-5, 6), 5) / 5, 4, 3, 0.99
+"""Shares of a window by which moments are moved, steps with a moment held, how often at most, and share of the cost
+from which it is done once more."""
 LEAST_SHARE = 0.2
 """Of the numbers measured, that noise is taken to have in the residuals however many are fitted."""
 STRAYED = 1.5
@@ -276,8 +279,33 @@ class Screen:
         ends = [end for end in ends if end[2] is not None]
         if not ends:
             return None
-        best = min(ends, key=lambda end: float(end[2].cost))
+        best = self._move_moments(begun.candidate, min(ends, key=lambda end: float(end[2].cost)), known.sigma)
         return self.settle(begun.candidate, best[0], best[1], known.sigma)
+
+    def _move_moments(self, candidate: Candidate, end: tuple[Any, ...], sigma: Array) -> tuple[Any, ...]:
+        """Go on from fits with each moment held at others within a window of it, as long as that is better.
+
+        What begins at the end of a window moves nothing in it, so that a fit has no slope there and stops.
+        """
+        window = self.shots.y.shape[1] * self.scene.system.dt
+        for k, place in self.offsets(candidate):
+            for i, (parameter, margin) in enumerate(zip(self.scene.parameters[k], self.scene.margin[k], strict=True)):
+                for _ in range(MOVES if parameter.moment else 0):
+                    held = []
+                    for value in float(margin.value(float(end[0][place.start + i]))) + SHIFTS * window:
+                        if parameter.low < value < parameter.high:
+                            p = np.array(end[0])
+                            p[place.start + i] = margin.standard(value)
+                            held.append(self.fit(candidate, p, end[1], sigma, HELD, scanned=False))
+                    held = [other for other in held if other[2] is not None]
+                    if not held:
+                        break
+                    start = min(held, key=lambda other: float(other[2].cost))
+                    best = self.fit(candidate, *start[:2], sigma, LASTING)
+                    if best[2] is None or not float(best[2].cost) < BETTER * float(end[2].cost):
+                        break
+                    end = best
+        return end
 
     def part(self, found: Screened, effects: tuple[int, ...]) -> Screened:
         """Some effects of a candidate by themselves, with the numbers that they have there."""

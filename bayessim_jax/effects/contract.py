@@ -136,6 +136,8 @@ class EffectParameter:
 
     least: float = 0.0
     """Magnitude below which it is no effect but the time step of the simulator: it is fitted, and not named."""
+    moment: bool = False
+    """A moment, from which on the effect acts: near the end of a window predictions hardly depend on it."""
 
     def __post_init__(self) -> None:
         if not self.low < self.start < self.high:

@@ -24,7 +24,7 @@ class GainDrop(ActEffect):
         """t* and k."""
         duration = scales.duration
         return (
-            EffectParameter("time", "s", 0.0, duration, 0.5 * duration, 0.5 * duration, scan=8),
+            EffectParameter("time", "s", 0.0, duration, 0.5 * duration, 0.5 * duration, scan=8, moment=True),
             EffectParameter("gain", "", 0.0, 2.0, 1.0, 0.8),
         )
 

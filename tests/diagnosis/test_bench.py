@@ -19,6 +19,7 @@ from bayessim_jax.diagnosis.procedure import (
     detect,
 )
 from bayessim_jax.diagnosis.response import Motion
+from bayessim_jax.diagnosis.screen import Begun
 from bayessim_jax.effects import EFFECTS, EffectParameter, Scales
 from bayessim_jax.inference.direct import estimate_noise
 from bayessim_jax.inference.replay import replay_window
@@ -36,20 +37,16 @@ PAIRS = (
 )
 
 
-@pytest.fixture(scope="module")
-def problem(tmp_path_factory):
-    jax.config.update("jax_enable_x64", True)
-    folder = tmp_path_factory.mktemp("bench") / "rig"
-    make_case(folder, "pendulum", "coulomb_friction", seed=3, recordings=2, seconds=2.0)
-    model = case_model(load_case(folder).check(), before=0.04)
+def pose(case, named):
+    """The problem that the two recordings of a case make, with effects that may be missing."""
+    model = case_model(load_case(case).check(), before=0.04)
     windows = model.windows([0, 1])
     inputs = model.inputs(windows)
-    scales = {place: Scales(timestep=0.002, period=0.004) for _, place in PAIRS}
-    pairs = tuple((EFFECTS[name], place) for name, place in PAIRS)
-    yield Problem(
+    scales = {place: Scales(timestep=0.002, period=0.004, duration=2.0) for _, place in named}
+    return Problem(
         model.system,
         model.margins,
-        pairs,
+        tuple((EFFECTS[name], place) for name, place in named),
         scales,
         model.shots(windows),
         windows.recording,
@@ -61,7 +58,33 @@ def problem(tmp_path_factory):
             inputs.time,
         ),
     )
+
+
+@pytest.fixture(scope="module")
+def problem(tmp_path_factory):
+    jax.config.update("jax_enable_x64", True)
+    folder = tmp_path_factory.mktemp("bench") / "rig"
+    make_case(folder, "pendulum", "coulomb_friction", seed=3, recordings=2, seconds=2.0)
+    yield pose(folder, PAIRS)
     jax.config.update("jax_enable_x64", False)
+
+
+def test_a_moment_is_found_from_the_end_of_a_window_too(problem, tmp_path):
+    """Where a fit has no slope: later than that, what changes lies in the next window, and earlier in the last row."""
+    sealed = make_case(tmp_path / "drop", "slide", "gain_drop", strength=0.4, seed=4, recordings=2, seconds=2.0)
+    true = sealed["effects"][0]["parameters"]
+    screen = pose(tmp_path / "drop", [("gain_drop", "actuator/motor")]).screen(
+        [(EFFECTS["gain_drop"], "actuator/motor")]
+    )
+    nothing = screen.begin(jnp.zeros(screen.d), jnp.array([0.01, 0.1]))
+    margins, d = screen.scene.margin[0], screen.d
+    for end in (0.5 * np.floor(true["time"] / 0.5), 0.5 * np.ceil(true["time"] / 0.5)):
+        p = np.array(nothing.p)
+        p[d : d + 2] = margins[0].standard(end), margins[1].standard(0.8)
+        begun = Begun(Candidate((0,)), [(p, nothing.delta)], 0.0)
+        found = screen.finish_candidate(begun, nothing)
+        values = [float(m.value(float(z))) for m, z in zip(margins, found.p[d : d + 2], strict=True)]
+        assert values == [pytest.approx(true["time"], abs=0.02), pytest.approx(true["gain"], abs=0.1)]
 
 
 @pytest.mark.parametrize("name", ["sensor_offset", "sensor_delay"])
