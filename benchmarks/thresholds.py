@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from bayessim_jax.diagnosis.verdict import Thresholds, falls_short
+from bayessim_jax.diagnosis.verdict import Thresholds, leaves_much
 from bayessim_jax.effects import EFFECTS
 from benchmarks.concealed import diagnose_drawn, draw_cases, judge, resumed
 
@@ -109,7 +109,7 @@ def summarize(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def hold_against_held_out(records: Sequence[Path]) -> str:
-    """How many recorded answers, of what kind, `falls_short` takes back, and the least that single effects leave ahead.
+    """How many recorded answers, of what kind, `leaves_much` takes back, and the least that single effects leave ahead.
 
     The latter are finalists for an effect of no library, of older records the one that came closest; with a memory they
     are excused where their past is unknown.
@@ -125,7 +125,7 @@ def hold_against_held_out(records: Sequence[Path]) -> str:
             kinds += ["in no library"] if row in unknown else []
             found.update(kinds)
             nrmse, floor = row["nrmse"], row["noise_floor"]
-            if falls_short(nrmse["baseline"], nrmse["augmented"], floor, Thresholds()):
+            if leaves_much(nrmse["baseline"], nrmse["augmented"], floor, Thresholds()):
                 back.update(kinds)
     for row in unknown:
         finalists = row.get("finalists", [row["closest"]])

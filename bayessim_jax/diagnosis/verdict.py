@@ -30,6 +30,7 @@ __all__ = [
     "has_special_case",
     "is_outdone",
     "is_worth",
+    "leaves_much",
     "may_be_named",
     "share_left",
     "ties",
@@ -351,18 +352,23 @@ def is_outdone(
     return bool(sure and was - now < thresholds.ceiling * (was - best))
 
 
+def leaves_much(baseline: float, answer: float, floor: float, thresholds: Thresholds) -> bool:
+    """Whether an answer leaves much of an error; errors as `nrmse`, `floor` what noise alone leaves."""
+    left = max(answer**2 - floor**2, 0.0) / max(baseline**2 - floor**2, 1e-12)
+    return answer > thresholds.visible * floor and left > thresholds.held
+
+
 def falls_short(
     baseline: Errors, answer: Errors, scale: Float[np.ndarray, " obs"], floor: float, thresholds: Thresholds
 ) -> bool:
-    """Whether an answer leaves much of the error on recordings left out; `floor` is the nrmse that noise alone leaves.
+    """Whether an answer leaves much of the error on recordings left out.
 
     In more windows than one, where there are some: where motion passes by a saddle, the best simulator may go astray.
     """
 
     def does(windows: Bool[np.ndarray, " windows"]) -> bool:
         was, now = (nrmse(Errors(e.error[windows], e.measured[windows]), scale) for e in (baseline, answer))
-        left = max(now**2 - floor**2, 0.0) / max(was**2 - floor**2, 1e-12)
-        return bool(now > thresholds.visible * floor and left > thresholds.held)
+        return leaves_much(was, now, floor, thresholds)
 
     size = ((answer.error / scale) ** 2).sum((1, 2))
     every = np.ones(len(size), bool)
