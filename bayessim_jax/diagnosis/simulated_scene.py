@@ -47,7 +47,7 @@ class SimulatedScene(CandidatesOf):
 
     def __init__(self, bench: Bench) -> None:
         self.bench = bench
-        self.margins, self.shots, self.pairs = bench.margins, bench.shots, bench.pairs
+        self.system, self.margins, self.shots, self.pairs = bench.system, bench.margins, bench.shots, bench.pairs
         self.d, self.slots = bench.d, bench.slots
         own = [bench.columns(Candidate((k,))) for k in range(len(bench.pairs))]
         self.parameters = [[bench.parameters[i] for i in columns] for columns in own]
