@@ -24,6 +24,12 @@ def pytest_configure(config):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICKLY_COMPILED}".strip()
 
 
+def pytest_collection_modifyitems(items):
+    """Whole runs take longest and go first, so that no worker is left alone with them."""
+    here = Path(__file__).parent
+    items.sort(key=lambda item: item.path.parent != here)
+
+
 @pytest.fixture(autouse=True)
 def forget_programs(request):
     """A process can hold only so many compiled programs, and slow tests compile hundreds."""

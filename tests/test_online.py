@@ -153,7 +153,8 @@ def test_a_python_loop_is_the_whole_run_bit_for_bit(cartpole, run):
     _check_that_a_loop_changes_nothing(*cartpole, run)
 
 
-@pytest.mark.parametrize(("warmup", "inferences"), [(1, 2), pytest.param(2, 0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("warmup", "inferences"), [(1, 2), (2, 0)])
 def test_cuts_change_nothing_where_only_some_rounds_infer(cartpole, run, warmup, inferences):
     setup, target = cartpole
     setup, key = setup.replace(warmup=warmup, inferences=inferences), jax.random.key(3)

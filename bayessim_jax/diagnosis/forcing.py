@@ -7,10 +7,12 @@ effect's numbers in their own units, and `rates`, how these grow with the variab
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
@@ -20,8 +22,10 @@ from bayessim_jax.effects.forces import recorded_steps
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS
 from bayessim_jax.programs import trace_once
 
-__all__ = ["Joint", "commands_of", "force_of", "restore_readings"]
+__all__ = ["Joint", "Partners", "Passed", "commands_of", "force_of", "pass_on", "restore_readings"]
 
+Numbers = Array | np.ndarray
+"""What is put together on the host, or comes from a program."""
 MANY = 12
 """Parameters beyond which reverse-mode derivatives of every moment's force cost less than forward-mode ones."""
 
@@ -40,6 +44,29 @@ class Joint:
     def moment(self, time: Array, h: float) -> Moment:
         """As effects see it."""
         return Moment(time, h, self.position, self.velocity, self.acceleration, self.inertia, self.drive)
+
+
+@struct.dataclass
+class Partners:
+    """How what an effect sees moves with every number of a candidate that has other effects beside it."""
+
+    own: Float[Numbers, "m k"]
+    """Of its own numbers."""
+    acceleration: Float[Numbers, "m windows steps"]
+    """Of the joint."""
+    drive: Float[Numbers, "m windows steps"]
+
+
+@struct.dataclass
+class Passed:
+    """Commands that have passed some effects, and how they move with every number of a candidate."""
+
+    commands: Float[Numbers, "windows steps act"]
+    """Of every time step; those before the window come first."""
+    older: Float[Numbers, "windows early act"]
+    """From before these."""
+    along: Float[Numbers, "m windows steps act"]
+    older_along: Float[Numbers, "m windows early act"]
 
 
 def _named(names: tuple[str, ...], numbers: Array) -> dict[str, Array]:
@@ -64,11 +91,12 @@ def force_of(
     other: Joint | None,
     earlier: tuple[Float[Array, "windows before"], ...] | None = None,
     period: float = 0.0,
+    partners: Partners | None = None,
 ) -> tuple[Float[Array, "windows rows"], Float[Array, "windows rows k"]]:
     """Mean force of a `ForceEffect` in every row of so many time steps, and its derivatives along x.
 
     `earlier` are positions, velocities and what actuators exerted before the windows, every `period` s, for one that
-    remembers them.
+    remembers them. Beside `partners`, derivatives are along all numbers of the candidate.
     """
 
     def moment(time: Array, joint: Joint, other: Joint | None) -> Moment:
@@ -79,7 +107,7 @@ def force_of(
         values = _named(names, x)
         return effect.force(values, effect.begin(values, moment(*now)), moment(*now))[0]
 
-    def force(x: Array) -> Array:
+    def force(x: Array, joint: Joint = joint) -> Array:
         values = _named(names, x)
 
         def window(time: Array, joint: Joint, other: Joint | None, earlier: Any) -> Array:
@@ -102,6 +130,14 @@ def force_of(
 
         return jax.vmap(window)(time, joint, other, earlier)
 
+    if partners is not None:
+
+        def among(x: Array, acceleration: Array, drive: Array) -> Array:
+            return force(x, dataclasses.replace(joint, acceleration=acceleration, drive=drive))
+
+        here = numbers, joint.acceleration, joint.drive
+        moves = partners.own, partners.acceleration, partners.drive
+        return jax.vmap(lambda *move: jax.jvp(among, here, move), out_axes=(None, -1))(*moves)
     now = jax.tree.map(lambda a: a[0, 0], (time, joint, other))
     remembers = jax.tree.leaves(effect.begin(_named(names, numbers), moment(*now)))
     if numbers.size <= MANY or remembers:
@@ -137,40 +173,89 @@ def commands_of(
     The first `before` of the commands come before the window and only fill what the effect remembers; so do `older`
     ones from before these, in steps of `coarse` s.
     """
-    single = commands.shape[-1] == 1
 
     def change(x: Array) -> Array:
-        values = _named(names, x)
+        new, _ = _arrive(effect, _named(names, x), h, before, coarse, time, joint, commands, older, gains[0])
+        changes = (new - commands)[:, before:]
+        return gains * changes.reshape(len(time), -1, steps, changes.shape[-1]).mean(2)
 
-        def window(time: Array, joint: Joint, commands: Array, older: Array) -> Array:
-            def moment(time: Array, joint: Joint) -> Moment:
-                return joint.moment(time, h)._replace(gain=gains[0])
+    return _with_slopes(change, numbers, rates)
 
-            def pick(row: Array) -> Any:
-                return row[0] if single else tuple(row)
 
-            def once(memory: Any, now: tuple[Array, Joint, Array]) -> tuple[Any, Array]:
-                time, joint, row = now
-                new, memory = effect.command(values, memory, pick(row), moment(time, joint))
-                return memory, jnp.stack(new if isinstance(new, tuple) else (new,)) - row
+@trace_once(
+    static_argnames=("effect", "names", "h", "before", "coarse"), compiler_options=COMPILER_OPTIONS, to_numpy=True
+)
+def pass_on(
+    effect: Any,
+    names: tuple[str, ...],
+    h: float,
+    before: int,
+    coarse: float,
+    numbers: Float[Array, " k"],
+    own: Float[Array, "m k"],
+    time: Float[Array, "windows steps"],
+    joint: Joint,
+    passed: Passed,
+    gains: Float[Array, " act"],
+) -> Passed:
+    """What arrives where an `ActEffect` takes commands that have passed others; as in `commands_of`.
 
-            rows = (time, joint, commands)
-            first = jax.tree.map(lambda a: a[0], rows)
-            long = bool(len(older)) and not effect.brief
-            begun = effect.begin(values, pick(older[0] if long else first[2]), moment(*first[:2]))
-            begun = jax.tree.map(lambda m: jnp.asarray(m, time.dtype), begun)
-            if long:
-                early = moment(*first[:2])._replace(h=coarse, time=time[0] - len(older) * coarse)
-                begun = jax.tree.map(lambda m: m[-1], effect.ahead(values, begun, pick(older.T), early)[1])
-            changes = jax.lax.scan(once, begun, rows)[1][before:]
-            return gains * changes.reshape(-1, steps, changes.shape[-1]).mean(1)
+    `own` are the ways of its own numbers as a candidate's numbers move.
+    """
 
-        return jax.vmap(window)(*begun, commands, older)
+    def arrive(x: Array, commands: Array, older: Array) -> tuple[Array, Array]:
+        return _arrive(effect, _named(names, x), h, before, coarse, time, joint, commands, older, gains[0])
+
+    here, moves = (numbers, passed.commands, passed.older), (own, passed.along, passed.older_along)
+    (new, long_ago), slopes = jax.vmap(lambda *move: jax.jvp(arrive, here, move), out_axes=(None, 0))(*moves)
+    return Passed(new, long_ago, *slopes)
+
+
+def _arrive(
+    effect: Any,
+    values: dict[str, Array],
+    h: float,
+    before: int,
+    coarse: float,
+    time: Float[Array, "windows steps"],
+    joint: Joint,
+    commands: Float[Array, "windows steps act"],
+    older: Float[Array, "windows early act"],
+    gain: Array,
+) -> tuple[Float[Array, "windows steps act"], Float[Array, "windows early act"]]:
+    """What arrives of commands, and of older ones; a brief memory has forgotten these and leaves them as they are."""
+    single = commands.shape[-1] == 1
+
+    def window(time: Array, joint: Joint, commands: Array, older: Array) -> tuple[Array, Array]:
+        def moment(time: Array, joint: Joint) -> Moment:
+            return joint.moment(time, h)._replace(gain=gain)
+
+        def pick(row: Array) -> Any:
+            return row[0] if single else tuple(row)
+
+        def stack(new: Any) -> Array:
+            return jnp.stack(new if isinstance(new, tuple) else (new,), -1)
+
+        def once(memory: Any, now: tuple[Array, Joint, Array]) -> tuple[Any, Array]:
+            time, joint, row = now
+            new, memory = effect.command(values, memory, pick(row), moment(time, joint))
+            return memory, stack(new)
+
+        rows = (time, joint, commands)
+        first = jax.tree.map(lambda a: a[0], rows)
+        long = bool(len(older)) and not effect.brief
+        begun = effect.begin(values, pick(older[0] if long else first[2]), moment(*first[:2]))
+        begun = jax.tree.map(lambda m: jnp.asarray(m, time.dtype), begun)
+        arrived = older
+        if long:
+            early = moment(*first[:2])._replace(h=coarse, time=time[0] - len(older) * coarse)
+            new, memories = effect.ahead(values, begun, pick(older.T), early)
+            begun, arrived = jax.tree.map(lambda m: m[-1], memories), stack(new)
+        return jax.lax.scan(once, begun, rows)[1], arrived
 
     earlier = jnp.concatenate([time[:, :1] + h * jnp.arange(-before, 0), time], 1)
     held = jax.tree.map(lambda a: jnp.concatenate([jnp.repeat(a[:, :1], before, 1), a], 1), joint)
-    begun = (earlier, held)
-    return _with_slopes(change, numbers, rates)
+    return jax.vmap(window)(earlier, held, commands, older)
 
 
 @trace_once(

@@ -82,8 +82,15 @@ HOPELESS = 0.25
 """Share that it leaves along the motion, from where on it is not, if another one explains the misfit."""
 TURNS = 3
 """How often rivals are fitted from the best one's numbers, where one of them then is the best."""
+TELLING = 20.0
+"""Nats by which a pair explains more along the motion than the best single effect, from where on it is simulated even
+if it leaves as much of the misfit there: that may be the screen's own error."""
+TURNED = 6
+"""Pairs of which the order is looked at, where it matters."""
 GENERAL = 8
 """Pairs that are begun from the numbers of a special case of them."""
+DRY = ("coulomb_friction", "stribeck_friction")
+"""Laws of dry friction that are special cases of others."""
 KIN = 2
 """Relatives of the best pair's members, of which partners are looked for as well."""
 WORTH = 0.5
@@ -237,7 +244,7 @@ def name_effects(
         found = _pair(key, growth, nothing, ranked)
         # without a model there is no motion to hold candidates against: what was simulated already is in its order
         chosen = found[:PAIRS] if isinstance(problem.system, Restarted) else _varied(found, nothing.score)
-        pairs = [pair for pair in chosen if remain(pair) < worth]
+        pairs = [pair for pair in chosen if remain(pair) < worth or pair.score > ranked[0].score + TELLING]
         if pairs:
             alone = {k for pair in pairs for k in pair.candidate.effects}
             best = {k for entry in entries[:2] for k in entry.candidate.effects}
@@ -328,7 +335,14 @@ class _Growth:
         first = self.screens[0]
         wider = {known.candidate + Candidate((k,)): k for k in range(len(first.pairs))}
         larger = len(known.candidate.effects) + 1
-        tried = [s for s in wider if len(s.effects) == larger and s not in self.seen and first.takes(s)]
+        tried = [
+            s
+            for s, k in wider.items()
+            if len(s.effects) == larger
+            and s not in self.seen
+            and first.takes(s)
+            and not any(_are_one_law(first, k, other) for other in known.candidate.effects)
+        ]
         self.seen.update(tried)
         many = len(tried) > RACED
         begin = {s: first.beside(s, known, self.alone.get(wider[s])) for s in tried}
@@ -349,13 +363,8 @@ class _Growth:
         split = [(s, kept) for s, kept in split if s not in self.seen and first.takes(s)]
         self.seen.update(s for s, _ in split)
 
-        def finish(screen: Screen, item: tuple[Candidate, Screened]) -> Screened | None:
-            candidate, beside = item
-            started = screen.begin_candidate(candidate, beside)
-            raced = screen.resume_candidate(started, beside) if started is not None else None
-            return screen.finish_candidate(raced, beside) if raced is not None else None
-
-        return [each for each in _each(self.screens, [*grown, *split], finish) if each is not None]
+        every = _each(self.screens, [*grown, *split], lambda screen, item: _search(screen, *item))
+        return [each for each in every if each is not None]
 
     def parts(self, known: Screened, but: Collection[Candidate]) -> list[Screened]:
         """Every effect of a set by itself, from its numbers there: beside another one it may be found by chance."""
@@ -371,6 +380,13 @@ class _Growth:
         found = _each(self.screens, list(ends), lambda screen, s: screen.glance(s, known, ends[s], steps))
         finite = [(s, each) for s, each in zip(ends, found, strict=True) if each]
         return dict(sorted(finite, key=lambda item: item[1][0][0]))
+
+
+def _search(screen: Screen, candidate: Candidate, known: Screened) -> Screened | None:
+    """A candidate fitted along the motion from all points that it is begun from beside what is known."""
+    begun = screen.begin_candidate(candidate, known)
+    raced = screen.resume_candidate(begun, known) if begun is not None else None
+    return screen.finish_candidate(raced, known) if raced is not None else None
 
 
 def _quiet(text: str) -> None:
@@ -471,6 +487,14 @@ def _is_special_case(screen: Screen, effect: int, other: int) -> bool:
     return effect != other and scene.sites[effect].joint >= 0 and contains(*names)
 
 
+def _are_one_law(screen: Screen, effect: int, other: int) -> bool:
+    """Whether of two laws of dry friction at one joint one has the other as a special case."""
+    return any(
+        screen.pairs[special][0].name in DRY and _is_special_case(screen, special, general)
+        for special, general in ((effect, other), (other, effect))
+    )
+
+
 def _promising(screen: Screen, ranked: Sequence[int]) -> list[int]:
     """Ranks that go on: the best ones, and the best places of every effect. Some explain little at first."""
     places: dict[str, int] = {}
@@ -533,7 +557,31 @@ def _pair(key: PRNGKeyArray, growth: _Growth, nothing: Screened, ranked: Sequenc
             found += growth.extend(known)
         found += _with_general_laws(growth.screens, sorted(found, key=_score, reverse=True))
     # of those that were begun twice the better one
-    return sorted({each.candidate: each for each in sorted(found, key=_score)}.values(), key=_score, reverse=True)
+    ranked = sorted({each.candidate: each for each in sorted(found, key=_score)}.values(), key=_score, reverse=True)
+    turned = _each(growth.screens, ranked[:TURNED], _turn)
+    return sorted([*turned, *ranked[TURNED:]], key=_score, reverse=True)
+
+
+def _turn(screen: Screen, pair: Screened) -> Screened:
+    """A pair with the effects of one actuator in the order that explains more: a limit before a loss or after it."""
+    effects = pair.candidate.effects
+    if not _follow_each_other(screen, *effects):
+        return pair
+    turned, same = Candidate(effects[::-1]), screen.part(pair, effects[::-1])
+    found = [screen.settle(turned, same.p, same.delta, same.sigma)]
+    # other numbers fit in the other order: also from those of each by itself
+    for k in effects:
+        part = screen.part(pair, (k,))
+        known = screen.settle(part.candidate, part.p, part.delta, part.sigma)
+        found.append(known and _search(screen, turned, known))
+    best = max(filter(None, found), key=_score, default=pair)
+    return best if best.score > pair.score + STUCK else pair
+
+
+def _follow_each_other(screen: Screen, one: int, other: int) -> bool:
+    """Whether two effects change the same commands one after the other."""
+    acting = all(screen.pairs[k][0].port == "act" for k in (one, other))
+    return acting and screen.pairs[one][1] == screen.pairs[other][1]
 
 
 def _with_general_laws(screens: Sequence[Screen], ranked: Sequence[Screened]) -> list[Screened]:
@@ -661,7 +709,8 @@ def _finish(
     """Candidates simulated and fitted from where the screen found them, and scored across recordings, best first.
 
     The best of those with many parameters that leave more than `remain` says of the motion are fitted from their usual
-    values, too: where joints stick and slip, what fits there may be far from what fits in simulation. Rivals of the
+    values, too, and from the numbers of parts of them: what fits there may be far from what fits in simulation, where
+    joints stick and slip for instance. Rivals of the
     best and parts of it are fitted from its numbers, and where one of them is then the best or ties with it, so are its
     own: none must win by a better start. Special cases and twins of the effects of what may be the answer are tried
     in their places. What was fitted before is taken as it was, and what turns out to be shortsighted is left out.
@@ -684,8 +733,10 @@ def _finish(
         others = (enter(entry.candidate, p, sigma) for p in points)
         return max([entry, *(other for other in others if other is not None)], key=lambda e: e.score)
 
-    def from_usual(entry: Entry) -> Entry:
-        return improve(entry, bench.starts(entry.candidate, jnp.zeros(bench.d)), entry.fit.sigma)
+    def from_elsewhere(entry: Entry) -> Entry:
+        parts = (e for e in entries if set(e.candidate.effects) < set(entry.candidate.effects))
+        points = [_with_numbers_of(bench, part, entry.candidate, entry.fit.z) for part in parts]
+        return improve(entry, [*points, *bench.starts(entry.candidate, jnp.zeros(bench.d))], entry.fit.sigma)
 
     def from_numbers_of(best: Entry, entry: Entry) -> Entry:
         return improve(entry, [_with_numbers_of(bench, best, entry.candidate, entry.fit.z)], best.fit.sigma)
@@ -709,7 +760,7 @@ def _finish(
         fresh = [e for e in entries if e.candidate not in before]
         left = [e for e in fresh if e.misfit.p_value < FALSE_ALARMS and len(bench.columns(e.candidate)) > SIMPLE]
         again = list(islice(filter(falls_short, left), AGAIN))
-        _replace(work, entries, zip(again, pool.map(from_usual, again), strict=True))
+        _replace(work, entries, zip(again, pool.map(from_elsewhere, again), strict=True))
         for _ in range(TURNS if entries else 0):
             best = entries[0]
             tried = {entry.candidate for entry in entries}

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 
 from bayessim_jax.beliefs.margins import Margin, Margins, values_between
 from bayessim_jax.diagnosis.bench import SLOTS, Candidate, CandidatesOf, margin_of_effect
-from bayessim_jax.diagnosis.forcing import Joint, commands_of, force_of, restore_readings
+from bayessim_jax.diagnosis.forcing import Joint, Partners, Passed, commands_of, force_of, pass_on, restore_readings
 from bayessim_jax.diagnosis.response import (
     Beside,
     Forcing,
@@ -165,13 +165,16 @@ class Scene(CandidatesOf):
         around = self._find_around(candidate, p, motion)
         (windows, rows, _), nv = self.motion.ctrl.shape, self.model.nv
         size = FEW if self.count(candidate) <= FEW and not readings else self.slots
-        force, along = np.zeros((windows, rows, nv)), np.zeros((windows, rows, nv, size))
-        for k, place in self.offsets(candidate):
-            for dof, f, slopes in self._pushes(k, p, place, around):
-                force[..., dof] += f
-                along[..., dof, place.start - self.d : place.stop - self.d] += slopes
+        pushes = _Pushes(np.zeros((windows, rows, nv)), np.zeros((windows, rows, nv, size)))
+        self._drive(candidate, p, around, pushes)
+        exerting = [(k, place) for k, place in self.offsets(candidate) if self.pairs[k][0].port == "force"]
+        # what holds a joint withstands what the others exert on it
+        for k, place in sorted(exerting, key=lambda item: self.pairs[item[0]][0].holds):
+            self._exert(k, p, place, around, pushes)
         raw = np.asarray(self._windowed(p, self.motion).seen) if readings else np.zeros(0)
-        forcing = Forcing(force, along, _distort(np.asarray(around.windowed.seen), raw, readings, nv, size))
+        forcing = Forcing(
+            pushes.force, pushes.along, _distort(np.asarray(around.windowed.seen), raw, readings, nv, size)
+        )
         return around, forcing, np.where(self._steps(candidate), p - around.p, 0.0)
 
     def states(self, delta: Float[Array, "windows n"]) -> list[Float[Array, "windows n"]]:
@@ -328,29 +331,82 @@ class Scene(CandidatesOf):
             readings.append(_Reading(channels.index(at(name)), v, own, along, along_v, slope))
         return dataclasses.replace(self.motion, qpos=_device(qpos), qvel=_device(qvel)), readings
 
-    def _pushes(
-        self, e: int, p: np.ndarray, place: slice, around: _Around
-    ) -> list[tuple[int, Float[np.ndarray, "windows steps"], Float[np.ndarray, "windows steps e"]]]:
-        """What an effect exerts: degree of freedom, force, and its derivatives along the effect's x."""
-        effect, site = self.pairs[e][0], self.sites[e]
-        if effect.port not in ("force", "act"):
-            return []
-        joint = self._joint(site.joint, around, site.actuators if effect.port == "force" else ())
-        names, numbers = self.names[e], self._numbers_at(e, p[place])
-        if effect.port == "force":
-            other = self._joint(site.other, around, ()) if site.other >= 0 else None
-            earlier = self._earlier(site.joint, around) if effect.recalls else None
-            seen = (self.h, self.fine, *numbers, self.times, joint, other, earlier, self.system.dt)
-            f, along = force_of(effect, names, site.detail, *seen)
-            return [(self._dof(site.joint), f, along)]
-        gains = self._gains(site.actuators, around)
-        commands, older, coarse, before = self._commands(site.actuators, effect.looks)
-        seen = (self.h, self.fine, before, coarse, *numbers, self.times, joint, commands, older, gains)
-        f, along = commands_of(effect, names, *seen)
-        return [
-            (self._dof(int(self.model.actuator_trnid[actuator, 0])), f[..., i], along[..., i, :])
-            for i, actuator in enumerate(site.actuators)
-        ]
+    def _drive(self, candidate: Candidate, p: Float[np.ndarray, " k"], around: _Around, pushes: _Pushes) -> None:
+        """What a candidate's effects on commands change in forces: those of the same actuators one after the other."""
+        groups: dict[tuple[int, ...], list[tuple[int, slice]]] = {}
+        for k, place in self.offsets(candidate):
+            if self.pairs[k][0].port == "act":
+                groups.setdefault(tuple(self.sites[k].actuators), []).append((k, place))
+        for actuators, effects in groups.items():
+            gains = self._gains(actuators, around)
+            if len(effects) == 1:
+                (k, place) = effects[0]
+                effect, joint = self.pairs[k][0], self._joint(self.sites[k].joint, around, ())
+                commands, older, coarse, before = self._commands(actuators, effect.looks)
+                seen = (*self._numbers_at(k, p[place]), self.times, joint, commands, older, gains)
+                f, along = commands_of(effect, self.names[k], self.h, self.fine, before, coarse, *seen)
+                columns = slice(place.start - self.d, place.stop - self.d)
+            else:
+                f, along = self._pass_all(effects, p, around, pushes.along.shape[-1])
+                columns = slice(None)
+            for i, actuator in enumerate(actuators):
+                dof = self._dof(int(self.model.actuator_trnid[actuator, 0]))
+                pushes.add(dof, f[..., i], along[..., i, :], columns, drives=True)
+
+    def _pass_all(
+        self, effects: Sequence[tuple[int, slice]], p: Float[np.ndarray, " k"], around: _Around, size: int
+    ) -> tuple[Float[np.ndarray, "windows rows act"], Float[np.ndarray, "windows rows act e"]]:
+        """What effects on the same commands change in forces together, and its derivatives along a candidate's x."""
+        actuators = self.sites[effects[0][0]].actuators
+        gains = self._gains(actuators, around)
+        raw, older, coarse, before = map(np.asarray, self._commands(actuators, False))
+        before, coarse = int(before), float(coarse)
+        passed = Passed(raw, older, np.zeros((size, *raw.shape)), np.zeros((size, *older.shape)))
+        for k, place in effects:
+            effect, joint = self.pairs[k][0], self._joint(self.sites[k].joint, around, ())
+            # an effect that looks at the joint has not seen what was before
+            unseen = before if effect.looks else 0
+            own, numbers = self._ways(place, size), self._numbers_at(k, p[place])
+            here = Passed(passed.commands[:, unseen:], passed.older, passed.along[:, :, unseen:], passed.older_along)
+            seen = (numbers[0], own * numbers[1], self.times, joint, here, gains)
+            new = pass_on(effect, self.names[k], self.h, before - unseen, coarse, *seen)
+            if unseen:
+                commands = np.concatenate([passed.commands[:, :unseen], new.commands], 1)
+                new = Passed(
+                    commands,
+                    passed.older,
+                    np.concatenate([passed.along[:, :, :unseen], new.along], 2),
+                    passed.older_along,
+                )
+            passed = new
+        rows = (len(raw), -1, self.fine, len(gains))
+        f = gains * (passed.commands - raw)[:, before:].reshape(rows).mean(2)
+        along = gains * passed.along[:, :, before:].reshape(size, *rows).mean(3)
+        return f, np.moveaxis(along, 0, -1)
+
+    def _exert(self, k: int, p: Float[np.ndarray, " k"], place: slice, around: _Around, pushes: _Pushes) -> None:
+        """Add what an effect exerts on its joint, under what others exert there."""
+        effect, site, dof = self.pairs[k][0], self.sites[k], self._dof(self.sites[k].joint)
+        joint = self._joint(site.joint, around, site.actuators)
+        other = self._joint(site.other, around, ()) if site.other >= 0 else None
+        earlier = self._earlier(site.joint, around) if effect.recalls else None
+        numbers, columns, partners = (
+            self._numbers_at(k, p[place]),
+            slice(place.start - self.d, place.stop - self.d),
+            None,
+        )
+        if dof in pushes.at and (effect.holds or effect.feels):
+            size = pushes.along.shape[-1]
+            joint, partners = pushes.beside(dof, joint, self._ways(place, size) * numbers[1], self.fine)
+            columns = slice(None)
+        seen = (self.h, self.fine, *numbers, self.times, joint, other, earlier, self.system.dt, partners)
+        f, along = force_of(effect, self.names[k], site.detail, *seen)
+        pushes.add(dof, f, along, columns)
+
+    def _ways(self, place: slice, size: int) -> Float[np.ndarray, "e own"]:
+        """How an effect's own numbers move with a candidate's."""
+        first = place.start - self.d
+        return np.eye(size, place.stop - place.start, -first)
 
     def _numbers_at(self, e: int, x: Float[np.ndarray, " k"]) -> tuple[np.ndarray, np.ndarray]:
         """An effect's parameters in their units, and how they grow with x."""
@@ -420,6 +476,43 @@ class Scene(CandidatesOf):
                 self.system, self.margins, place, driving, self.fine, around.p[: self.d], around.motion, around.lin
             )
         return around.kept[key]
+
+
+@dataclass
+class _Pushes:
+    """What a candidate's effects add to the forces in every row, and its derivatives along its x."""
+
+    force: Float[np.ndarray, "windows rows nv"]
+    along: Float[np.ndarray, "windows rows nv e"]
+    at: set[int] = field(default_factory=set)
+    """Degrees of freedom that something was added to."""
+    drives: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    """What actuators exert there besides, and its derivatives."""
+
+    def add(self, dof: int, f: np.ndarray, along: np.ndarray, columns: slice, drives: bool = False) -> None:
+        """Add a force; its derivatives are along a part of x."""
+        self.at.add(dof)
+        self.force[..., dof] += f
+        self.along[..., dof, columns] += along
+        if drives:
+            self.drives[dof] = self.force[..., dof].copy(), self.along[..., dof, :].copy()
+
+    def beside(self, dof: int, joint: Joint, own: Float[np.ndarray, "e own"], fine: int) -> tuple[Joint, Partners]:
+        """A joint under what was added, as an effect sees it that is next; `own` are the ways of its own numbers."""
+
+        def steps(rows: np.ndarray) -> np.ndarray:
+            return np.repeat(rows, fine, axis=1)
+
+        response = CAUTION / np.asarray(joint.inertia)
+        along = np.moveaxis(steps(self.along[..., dof, :]), -1, 0)
+        partners = Partners(own, response * along, np.zeros_like(along))
+        acceleration = joint.acceleration + response * steps(self.force[..., dof])
+        drive = np.asarray(joint.drive)
+        if dof in self.drives:
+            more, slopes = self.drives[dof]
+            drive = drive + steps(more)
+            partners = dataclasses.replace(partners, drive=np.moveaxis(steps(slopes), -1, 0))
+        return dataclasses.replace(joint, acceleration=np.asarray(acceleration), drive=drive), partners
 
 
 @dataclass(frozen=True, eq=False)

@@ -206,7 +206,7 @@ class Screen:
         """
         self.scene.begin_around(known.candidate, known.p)
         added = Candidate(tuple(k for k in candidate.effects if k not in known.candidate.effects))
-        points = [self._put(added, known, start) for start in self.starts(added)]
+        points = [self._put(candidate, known, start) for start in self.starts(added)]
         strayed = (np.arange(self.d + self.slots) < self.d) & (np.abs(known.p) > STRAYED)
         if strayed.any():
             points += [np.where(strayed, 0.0, point) for point in points]
@@ -233,9 +233,8 @@ class Screen:
                 p[own[other]] = simpler.p[held[other]]
             for i, (parameter, range_) in enumerate(zip(parameters[k], margin[k], strict=True)):
                 if parameter.unit in values:
-                    inside = EDGE * (parameter.high - parameter.low)
-                    value = np.clip(values[parameter.unit], parameter.low + inside, parameter.high - inside)
-                    p[own[k].start + i] = range_.standard(float(value))
+                    value = np.clip(values[parameter.unit], parameter.low, parameter.high)
+                    p[own[k].start + i] = np.clip(range_.standard(float(value)), ndtri(EDGE), ndtri(1.0 - EDGE))
             ends[p.tobytes()] = (p, simpler.delta)
         return self._race(candidate, known, list(ends.values()), RACES)
 
@@ -341,9 +340,9 @@ class Screen:
         begin, weak = self._begin(added), self._begin(added, NEAR)
         points = [weak, begin] if np.abs(begin - weak).max(initial=0.0) > 0.0 else [begin]
         starts = [*points, *([alone] if alone is not None else [])]
-        ends = [(self._put(added, known, start), known.delta) for start in starts]
+        ends = [(self._put(candidate, known, start), known.delta) for start in starts]
         if any(p.scan for k in added.effects for p in self.scene.parameters[k]):
-            scan = [(self._put(added, known, start), known.delta) for start in self.starts(added)]
+            scan = [(self._put(candidate, known, start), known.delta) for start in self.starts(added)]
             self.scene.begin_around(known.candidate, known.p)
             found = self._race(candidate, known, scan, SCAN)
             ends += found.ends if found is not None else []
@@ -363,11 +362,13 @@ class Screen:
         parameters = [p for k in candidate.effects for p in self.scene.parameters[k]]
         return begin_point(parameters, [m for k in candidate.effects for m in self.scene.margin[k]], share)
 
-    def _put(self, added: Candidate, known: Screened, start: Float[np.ndarray, " e"]) -> Float[np.ndarray, " k"]:
-        """The p of what is known with effects added to it, which begin at `start`."""
+    def _put(self, candidate: Candidate, known: Screened, start: Float[np.ndarray, " e"]) -> Float[np.ndarray, " k"]:
+        """A candidate's p with the numbers of what is known of it; the others, in their order, begin at `start`."""
         p = np.zeros(self.d + self.slots)
         p[: self.d] = known.p[: self.d]
-        own, held = dict(self.offsets(added)), dict(self.offsets(known.candidate))
-        for k, place in self.offsets(known.candidate + added):
-            p[place] = known.p[held[k]] if k in held else start[own[k].start - self.d : own[k].stop - self.d]
+        held, used = dict(self.offsets(known.candidate)), 0
+        for k, place in self.offsets(candidate):
+            size = place.stop - place.start
+            p[place] = known.p[held[k]] if k in held else start[used : used + size]
+            used += 0 if k in held else size
         return p

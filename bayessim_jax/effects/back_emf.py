@@ -26,7 +26,7 @@ class BackEmf(ActEffect):
         high = 2.0 * scales.command / scales.speed
         return (
             EffectParameter("constant", f"s/{scales.unit}", 0.0, high, 0.0, 0.1 * high),
-            EffectParameter("resistance", "", 0.3, 3.0, 1.0, 1.05, log=True),
+            EffectParameter("resistance", "", 0.2, 5.0, 1.0, 1.05, log=True),
         )
 
     def command(self, values: Values, memory: Memory, command: Any, moment: Moment) -> tuple[Any, Memory]:

@@ -45,12 +45,15 @@ class Backlash(OpenForm, ForceEffect):
         inertia, k = scales.inertia, scales.force / reach
         unit = f"{scales.force_unit}/{scales.unit}"
         teeth = (
-            EffectParameter("stiffness", unit, 10.0 * k, 1e6 * k, 1e6 * k, 1e3 * k, log=True, scan=3, form=0.3),
+            EffectParameter("stiffness", unit, 10.0 * k, 1e6 * k, 1e6 * k, 1e3 * k, log=True, form=0.3),
             EffectParameter("damping", "", 0.02, 2.0, 1.0, 0.3, log=True, form=0.3),
         )
+        # a heavy rotor takes as long through a small gap as a light one through a large: fits do not find along that
         return (
-            EffectParameter("gap", scales.unit, 0.0, 0.5 * reach, 0.0, 0.03 * reach, form=0.02),
-            EffectParameter("rotor_inertia", scales.inertia_unit, 0.0, inertia, 0.0, 0.1 * inertia, scan=3),
+            EffectParameter("gap", scales.unit, 1e-3 * reach, reach, 0.0, 0.03 * reach, log=True, scan=5, form=0.02),
+            EffectParameter(
+                "rotor_inertia", scales.inertia_unit, 1e-3 * inertia, inertia, 0.0, 0.05 * inertia, log=True, scan=5
+            ),
             *(teeth if self.rounded else ()),
         )
 

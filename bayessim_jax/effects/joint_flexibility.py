@@ -27,6 +27,7 @@ class JointFlexibility(ForceEffect):
     """
 
     name = "joint_flexibility"
+    feels = True
     recalls = True
 
     def places(self, model: mujoco.MjModel) -> list[str]:

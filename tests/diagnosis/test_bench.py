@@ -14,6 +14,7 @@ from bayessim_jax.diagnosis.procedure import (
     _folds,
     _log_share,
     _stand_ins,
+    _turn,
     _varied,
     _with_numbers_of,
     detect,
@@ -125,6 +126,38 @@ def test_normal_equations_are_those_of_all_derivatives(problem, effects):
     np.testing.assert_allclose(r, seen, atol=1e-12)
     asked = normal_equations(seen.reshape(len(seen), -1), slopes, jnp.asarray(p), delta / scene.shots.spread)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), curvature, asked)
+
+
+@pytest.mark.parametrize("effects", [(0, 2), (2, 3), (3, 2), (5, 2), (2, 5)])
+def test_effects_beside_others_have_the_slopes_of_differences(problem, effects):
+    """Commands pass one effect after the other, and friction holds against what they then exert."""
+    pairs = [*problem.pairs, (EFFECTS["back_emf"], "actuator/motor")]
+    scene = problem.screen(pairs).scene
+    candidate, p = Candidate(effects), np.zeros(scene.d + scene.slots)
+    count = scene.count(candidate)
+    p[scene.d : scene.d + count] = 0.3 * np.random.default_rng(0).normal(size=count)
+    sigma, still = jnp.full(len(problem.system.channels), 0.1), jnp.zeros((len(scene.motion.start), 2))
+    here, slopes = scene.expand(candidate, p, still, sigma)
+    for k in range(scene.d, scene.d + count):
+        ahead, behind = (
+            scene.expand(candidate, p + e * (np.arange(p.size) == k), still, sigma)[0] for e in (1e-5, -1e-5)
+        )
+        asked = -np.asarray(slopes)[:, k].reshape(here.shape)
+        np.testing.assert_allclose(asked, (ahead - behind) / 2e-5, atol=1e-3 * np.abs(asked).max())
+
+
+def test_a_pair_on_one_motor_is_found_in_the_order_of_the_machine(problem, tmp_path):
+    """A bias that is added to a limited command is not one that is limited with it."""
+    names = ("actuator_bias", "actuator_saturation")
+    make_case(tmp_path / "rig", "pendulum", names[::-1], strength=0.3, seed=2, recordings=2, seconds=2.0)
+    rig = pose(tmp_path / "rig", [(name, "actuator/motor") for name in names])
+    screen = rig.screen(rig.pairs)
+    nothing = screen.begin(jnp.zeros(screen.d), jnp.array([0.01, 0.1]))
+    begun = screen.begin_candidate(Candidate((0, 1)), nothing)
+    pair = screen.finish_candidate(screen.resume_candidate(begun, nothing), nothing)
+    turned = _turn(screen, pair)
+    assert turned.candidate.effects == (1, 0) and turned.score > pair.score + 100
+    assert _turn(screen, turned) is turned
 
 
 def predicted(bench, candidate, x):

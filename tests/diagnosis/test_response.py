@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayessim_jax.diagnosis.flexible import FLEXIBLE, FlexibleForce
-from bayessim_jax.diagnosis.forcing import Joint, commands_of, force_of, restore_readings
+from bayessim_jax.diagnosis.forcing import Joint, Passed, commands_of, force_of, pass_on, restore_readings
 from bayessim_jax.diagnosis.response import (
     Beside,
     Forcing,
@@ -213,6 +213,22 @@ def test_a_lag_along_the_commands_is_the_difference_of_two_equations(long_ago):
     after = 0.002 * (np.arange(40).reshape(20, 2).mean(1) + 0.5)
     held = long_ago * np.exp(-1.0) - 1.0
     np.testing.assert_allclose(changes[0, :, 0], 3.0 * held * np.exp(-after / 0.04), atol=5e-3)
+
+
+def test_commands_pass_a_limit_after_a_lag():
+    """1 − e^(−t/T) of a step until it reaches the limit; along T only before that, along the limit only after."""
+    commands, older = jnp.ones((1, 60, 1)).at[:, :20].set(0.0), jnp.zeros((1, 0, 1))
+    time, joint = along(jnp.zeros((1, 40)))
+    passed = Passed(commands, older, jnp.zeros((2, *commands.shape)), jnp.zeros((2, *older.shape)))
+    for name, parameter, own in (("actuator_lag", "time_constant", 0), ("actuator_saturation", "limit", 1)):
+        numbers = np.array([0.04 if own == 0 else 0.5]), np.eye(2)[:, own : own + 1]
+        passed = pass_on(EFFECTS[name], (parameter,), 0.002, 20, 0.01, *numbers, time, joint, passed, jnp.ones(1))
+    arrived, t = passed.commands[0, 20:, 0], 0.002 * (np.arange(40) + 0.5)
+    np.testing.assert_allclose(arrived, np.minimum(1.0 - np.exp(-t / 0.04), 0.5), atol=5e-3)
+    free = arrived < 0.49
+    np.testing.assert_allclose(passed.along[1, 0, 20:, 0][~free][1:], 1.0, atol=1e-6)
+    np.testing.assert_allclose(passed.along[0, 0, 20:, 0][~free][1:], 0.0, atol=1e-6)
+    np.testing.assert_allclose(passed.along[0, 0, 20:, 0][free], (-t / 0.04**2 * np.exp(-t / 0.04))[free], atol=0.3)
 
 
 def test_a_scaled_sensor_is_undone_with_its_derivatives():
