@@ -85,7 +85,7 @@ TURNS = 3
 TELLING = 20.0
 """Nats by which a pair explains more along the motion than the best single effect, from where on it is simulated even
 if it leaves as much of the misfit there: that may be the screen's own error."""
-TURNED = 6
+TURNED = 4
 """Pairs of which the order is looked at, where it matters."""
 GENERAL = 8
 """Pairs that are begun from the numbers of a special case of them."""

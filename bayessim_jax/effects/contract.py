@@ -263,9 +263,8 @@ class ForceEffect(Effect, Protocol):
     port: str = "force"
     holds: bool = False
     """Whether it looks at `acceleration` or `stop`, and so must not find its own force in them."""
-
     feels: bool = False
-    """Whether it looks at `drive`, or at `acceleration` where a simulation begins."""
+    """Whether it looks at `drive`, or at `acceleration` where a simulation begins; known of what holds anyway."""
     recalls: bool = False
     """Whether it remembers what happened long before; otherwise the state that it begins in says enough."""
     settles: bool = True
