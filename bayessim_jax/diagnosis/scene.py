@@ -372,12 +372,8 @@ class Scene(CandidatesOf):
             new = pass_on(effect, self.names[k], self.h, before - unseen, coarse, *seen)
             if unseen:
                 commands = np.concatenate([passed.commands[:, :unseen], new.commands], 1)
-                new = Passed(
-                    commands,
-                    passed.older,
-                    np.concatenate([passed.along[:, :, :unseen], new.along], 2),
-                    passed.older_along,
-                )
+                along = np.concatenate([passed.along[:, :, :unseen], new.along], 2)
+                new = dataclasses.replace(passed, commands=commands, along=along)
             passed = new
         rows = (len(raw), -1, self.fine, len(gains))
         f = gains * (passed.commands - raw)[:, before:].reshape(rows).mean(2)
@@ -390,11 +386,8 @@ class Scene(CandidatesOf):
         joint = self._joint(site.joint, around, site.actuators)
         other = self._joint(site.other, around, ()) if site.other >= 0 else None
         earlier = self._earlier(site.joint, around) if effect.recalls else None
-        numbers, columns, partners = (
-            self._numbers_at(k, p[place]),
-            slice(place.start - self.d, place.stop - self.d),
-            None,
-        )
+        numbers, partners = self._numbers_at(k, p[place]), None
+        columns = slice(place.start - self.d, place.stop - self.d)
         if dof in pushes.at and (effect.holds or effect.feels):
             size = pushes.along.shape[-1]
             joint, partners = pushes.beside(dof, joint, self._ways(place, size) * numbers[1], self.fine)
