@@ -38,6 +38,7 @@ __all__ = [
     "begin_value",
     "bounded_numbers",
     "margin_of_effect",
+    "traded",
 ]
 
 NEAR = 0.1
@@ -273,6 +274,17 @@ class Bench:
         start, how = (x, delta, sigma, self.free(candidate)), {"steps": steps, "step": self.step, "damping": damping}
         return solve(self.simulator(candidate), own, *start, **how, live=self.used(candidate))
 
+    def traded(self, candidate: Candidate, x: Float[Array, " k"]) -> list[Float[Array, " k"]]:
+        """Points at which one of a candidate's effects has other numbers that do much the same."""
+        points, first = [], self.d
+        for k in candidate.effects:
+            own = slice(self.first[k], self.first[k + 1])
+            place = slice(first, first + own.stop - own.start)
+            first, z = place.stop, np.asarray(x)
+            for other in traded(self.pairs[k][0], self.parameters[own], self.each[own], z[place]):
+                points.append(jax.device_put(np.concatenate([z[: place.start], other, z[place.stop :]])))
+        return points
+
     def replay(
         self, candidate: Candidate, x: Float[Array, " k"], shots: Shots, delta: Float[Array, " n"] | float = 0.0
     ) -> Float[np.ndarray, "windows rows obs"]:
@@ -316,6 +328,18 @@ def begin_value(p: EffectParameter, share: float = 1.0) -> float:
     """Where a fit begins: so much of the way from neutral to the usual value, if the effect grows along it."""
     grows = np.isfinite(p.neutral) and p.low <= p.neutral <= p.high and not p.log
     return p.neutral + share * (p.start - p.neutral) if grows and share < 1.0 else p.start
+
+
+def traded(
+    effect: Any, parameters: Sequence[EffectParameter], margins: Sequence[Margin], z: Sequence[float] | np.ndarray
+) -> list[Float[np.ndarray, " e"]]:
+    """The z of other numbers of an effect that do much the same as these."""
+    trade = getattr(effect, "trade", None)
+    if trade is None:
+        return []
+    values = {p.name: float(m.value(float(x))) for p, m, x in zip(parameters, margins, z, strict=True)}
+    named = list(zip(parameters, margins, strict=True))
+    return [np.array([m.standard(other[p.name]) for p, m in named]) for other in trade(values)]
 
 
 _replay = trace_once(predict_all, static_argnames="predict", compiler_options=COMPILER_OPTIONS)

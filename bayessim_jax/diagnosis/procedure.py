@@ -710,10 +710,10 @@ def _finish(
 
     The best of those with many parameters that leave more than `remain` says of the motion are fitted from their usual
     values, too, and from the numbers of parts of them: what fits there may be far from what fits in simulation, where
-    joints stick and slip for instance. Rivals of the
-    best and parts of it are fitted from its numbers, and where one of them is then the best or ties with it, so are its
-    own: none must win by a better start. Special cases and twins of the effects of what may be the answer are tried
-    in their places. What was fitted before is taken as it was, and what turns out to be shortsighted is left out.
+    joints stick and slip for instance. Where numbers trade for each other, candidates are fitted from far along that,
+    too. Rivals of the best and parts of it are fitted from its numbers, and where one of them is then the best or ties
+    with it, so are its own: none must win by a better start. Special cases and twins of what may be the answer are
+    tried in their places. What was fitted before is taken as it was, and what turns out to be shortsighted is left out.
     """
     bench, before = work.bench, dict(work.done)
     work.say(f"simulating {sum(c.candidate not in before for c in candidates)} candidates; compiling takes a while")
@@ -738,6 +738,13 @@ def _finish(
         points = [_with_numbers_of(bench, part, entry.candidate, entry.fit.z) for part in parts]
         return improve(entry, [*points, *bench.starts(entry.candidate, jnp.zeros(bench.d))], entry.fit.sigma)
 
+    def from_traded(entry: Entry) -> Entry:
+        for _ in range(TURNS):
+            before, entry = entry, improve(entry, bench.traded(entry.candidate, entry.fit.z), entry.fit.sigma)
+            if entry is before:
+                break
+        return entry
+
     def from_numbers_of(best: Entry, entry: Entry) -> Entry:
         return improve(entry, [_with_numbers_of(bench, best, entry.candidate, entry.fit.z)], best.fit.sigma)
 
@@ -761,6 +768,8 @@ def _finish(
         left = [e for e in fresh if e.misfit.p_value < FALSE_ALARMS and len(bench.columns(e.candidate)) > SIMPLE]
         again = list(islice(filter(falls_short, left), AGAIN))
         _replace(work, entries, zip(again, pool.map(from_elsewhere, again), strict=True))
+        trading = [e for e in entries if e.candidate not in before and bench.traded(e.candidate, e.fit.z)][:AGAIN]
+        _replace(work, entries, zip(trading, pool.map(from_traded, trading), strict=True))
         for _ in range(TURNS if entries else 0):
             best = entries[0]
             tried = {entry.candidate for entry in entries}

@@ -7,8 +7,9 @@ hundredths of a second, so that pairs are tried as well. What comes out on top i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain, product
 from typing import Any
 
@@ -18,11 +19,13 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 from scipy.special import ndtri
 
-from bayessim_jax.diagnosis.bench import NEAR, Candidate, begin_point, bounded_numbers
+from bayessim_jax.beliefs.margins import Margin
+from bayessim_jax.diagnosis.bench import NEAR, Candidate, begin_point, bounded_numbers, traded
 from bayessim_jax.diagnosis.response import propose
 from bayessim_jax.diagnosis.scene import Scene
 from bayessim_jax.diagnosis.simulated_scene import SimulatedScene
 from bayessim_jax.diagnosis.whiteness import Misfit, judge_misfit
+from bayessim_jax.effects import EffectParameter
 from bayessim_jax.inference.direct import noise_floor, noise_level
 from bayessim_jax.inference.shooting import in_units
 
@@ -40,8 +43,8 @@ SCAN = ((2, False, 2),)
 LASTING = 8
 """Further steps of those that went on."""
 SHIFTS, HELD, MOVES, BETTER = np.delete(np.arange(-5, 6), 5) / 5, 4, 3, 0.99
-"""Shares of a window by which moments are moved, steps with a moment held, how often at most, and share of the cost
-from which it is done once more."""
+"""Shares of a window by which moments are moved, steps from there and from traded numbers, how often at most, and share
+of the cost from which it is done once more."""
 LEAST_SHARE = 0.2
 """Of the numbers measured, that noise is taken to have in the residuals however many are fitted."""
 STRAYED = 1.5
@@ -279,6 +282,7 @@ class Screen:
         if not ends:
             return None
         best = self._move_moments(begun.candidate, min(ends, key=lambda end: float(end[2].cost)), known.sigma)
+        best = self._trade(begun.candidate, best, known.sigma)
         return self.settle(begun.candidate, best[0], best[1], known.sigma)
 
     def _move_moments(self, candidate: Candidate, end: tuple[Any, ...], sigma: Array) -> tuple[Any, ...]:
@@ -287,23 +291,49 @@ class Screen:
         What begins at the end of a window moves nothing in it, so that a fit has no slope there and stops.
         """
         window = self.shots.y.shape[1] * self.scene.system.dt
+
+        def move(p: np.ndarray, i: int, parameter: EffectParameter, margin: Margin) -> list[np.ndarray]:
+            values = float(margin.value(float(p[i]))) + SHIFTS * window
+            inside = [value for value in values if parameter.low < value < parameter.high]
+            return [np.where(np.arange(p.size) == i, margin.standard(value), p) for value in inside]
+
         for k, place in self.offsets(candidate):
             for i, (parameter, margin) in enumerate(zip(self.scene.parameters[k], self.scene.margin[k], strict=True)):
-                for _ in range(MOVES if parameter.moment else 0):
-                    held = []
-                    for value in float(margin.value(float(end[0][place.start + i]))) + SHIFTS * window:
-                        if parameter.low < value < parameter.high:
-                            p = np.array(end[0])
-                            p[place.start + i] = margin.standard(value)
-                            held.append(self.fit(candidate, p, end[1], sigma, HELD, scanned=False))
-                    held = [other for other in held if other[2] is not None]
-                    if not held:
-                        break
-                    start = min(held, key=lambda other: float(other[2].cost))
-                    best = self.fit(candidate, *start[:2], sigma, LASTING)
-                    if best[2] is None or not float(best[2].cost) < BETTER * float(end[2].cost):
-                        break
-                    end = best
+                if parameter.moment:
+                    others = partial(move, i=place.start + i, parameter=parameter, margin=margin)
+                    end = self._leap(candidate, end, sigma, others, scanned=False)
+        return end
+
+    def _trade(self, candidate: Candidate, end: tuple[Any, ...], sigma: Array) -> tuple[Any, ...]:
+        """Go on from other numbers that do much the same as those found, as long as that is better."""
+
+        def trade(p: np.ndarray, k: int, place: slice) -> list[np.ndarray]:
+            others = traded(self.pairs[k][0], self.scene.parameters[k], self.scene.margin[k], p[place])
+            return [np.concatenate([p[: place.start], z, p[place.stop :]]) for z in others]
+
+        for k, place in self.offsets(candidate):
+            end = self._leap(candidate, end, sigma, partial(trade, k=k, place=place))
+        return end
+
+    def _leap(
+        self,
+        candidate: Candidate,
+        end: tuple[Any, ...],
+        sigma: Array,
+        others: Callable[[np.ndarray], list[np.ndarray]],
+        scanned: bool = True,
+    ) -> tuple[Any, ...]:
+        """Go on from the best of other points than a fit came to, as long as that is better."""
+        for _ in range(MOVES):
+            tried = [self.fit(candidate, p, end[1], sigma, HELD, scanned) for p in others(np.array(end[0]))]
+            tried = [other for other in tried if other[2] is not None]
+            if not tried:
+                break
+            start = min(tried, key=lambda other: float(other[2].cost))
+            best = self.fit(candidate, *start[:2], sigma, LASTING)
+            if best[2] is None or not float(best[2].cost) < BETTER * float(end[2].cost):
+                break
+            end = best
         return end
 
     def part(self, found: Screened, effects: tuple[int, ...]) -> Screened:

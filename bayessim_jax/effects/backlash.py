@@ -48,7 +48,6 @@ class Backlash(OpenForm, ForceEffect):
             EffectParameter("stiffness", unit, 10.0 * k, 1e6 * k, 1e6 * k, 1e3 * k, log=True, form=0.3),
             EffectParameter("damping", "", 0.02, 2.0, 1.0, 0.3, log=True, form=0.3),
         )
-        # a heavy rotor takes as long through a small gap as a light one through a large: fits do not find along that
         return (
             EffectParameter("gap", scales.unit, 1e-3 * reach, reach, 0.0, 0.03 * reach, log=True, scan=5, form=0.02),
             EffectParameter(
@@ -56,6 +55,11 @@ class Backlash(OpenForm, ForceEffect):
             ),
             *(teeth if self.rounded else ()),
         )
+
+    def trade(self, values: dict[str, float]) -> list[dict[str, float]]:
+        """A heavier rotor that takes as long through a smaller gap, and a lighter one through a larger."""
+        gap, rotor = values["gap"], values["rotor_inertia"]
+        return [values | {"gap": gap / by, "rotor_inertia": rotor * by} for by in (0.5, 2.0)]
 
     def begin(self, values: Values, moment: Moment) -> Memory:
         """θ and θ̇ of a motor that moves with the joint, at the end of the gap to which it presses."""

@@ -287,6 +287,10 @@ class ForceEffect(Effect, Protocol):
 
         return jax.lax.scan(once, memory, (past.positions[:-1], past.velocities[:-1], past.drives))[0]
 
+    def trade(self, values: dict[str, float]) -> list[dict[str, float]]:
+        """Other numbers that do much the same, far along a bend that fits do not find around."""
+        return []
+
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
         """The force during the time step, N or N m, and the memory for the next one."""
         ...

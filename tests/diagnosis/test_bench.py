@@ -294,6 +294,23 @@ def test_a_delay_shorter_than_a_step_is_not_told(problem, seconds, told):
     assert problem.bench(problem.pairs).told(both, x) == [0, 2], "a simulator whose step moves nothing"
 
 
+def test_a_rotor_trades_for_a_gap_and_nothing_else_changes(problem):
+    """As long through a gap of half the size with twice the rotor; no other effect of the pair has other numbers."""
+    pairs = [problem.pairs[2], (EFFECTS["backlash"], "actuator/motor")]
+    bench = problem.bench(pairs)
+    both = Candidate((0, 1))
+    x = np.array(bench.starts(both, jnp.array([0.3]))[-1])
+    here = bench.values(both, x)
+    gap, rotor = (f"backlash@actuator/motor/{name}" for name in ("gap", "rotor_inertia"))
+    points = bench.traded(both, x)
+    assert len(points) == 2 and not bench.traded(Candidate((0,)), x)
+    for point, by in zip(points, (2.0, 0.5), strict=True):
+        there = bench.values(both, point)
+        assert there[gap] == pytest.approx(by * here[gap]) and there[rotor] == pytest.approx(here[rotor] / by)
+        assert all(there[name] == pytest.approx(here[name]) for name in here if name not in (gap, rotor))
+        np.testing.assert_array_equal(point[: bench.d + 1], x[: bench.d + 1])
+
+
 def test_stand_ins_take_the_place_of_effects_of_a_set(problem):
     bench = problem.bench(problem.pairs)
     assert _stand_ins(bench, Candidate((1, 2))) == [Candidate((0, 2))]
