@@ -105,6 +105,7 @@ def test_slips_are_told_at_once(settings, message):
         Mppi.create(WIDE, **settings)
 
 
+@pytest.mark.slow
 def test_the_pendulum_swings_up_from_fifty_random_starts():
     system, task = Pendulum.create(), Upswing()
     theta = jnp.array([1.0, 1.0])

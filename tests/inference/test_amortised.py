@@ -52,6 +52,7 @@ def amortised(shots, seed=0, **options):
     )
 
 
+@pytest.mark.slow
 def test_a_linear_simulator_has_the_posterior_that_algebra_gives():
     """Mean within 0.5 standard deviations, standard deviations from 0.8 to 1.5 times, correlation within 0.2."""
     shots = made([0.7, -1.1])

@@ -56,6 +56,7 @@ def test_flat_directions_of_a_box_come_out_flat():
     assert abs(outer_fifth(keys[3], jax.vmap(found.apply)(fresh), told, *BOX) - 0.2) < 0.04
 
 
+@pytest.mark.slow
 def test_a_bent_ridge_is_followed():
     """Only θ₁θ₂ is measured: the law given the product is a hyperbola, which no Gaussian is."""
     keys = jax.random.split(jax.random.key(1), 4)

@@ -67,6 +67,7 @@ def test_on_mujoco_it_is_the_environment():
     assert same_end.all()
 
 
+@pytest.mark.slow
 def test_friction_that_follows_the_environment_is_the_environments():
     """With Brax's own solver a sliding foot needs more than half as much again."""
     errors = follow(Hopper.create(noise=0.0), *record(30, 15, 0, speed=1.0))
