@@ -280,10 +280,9 @@ class Bench:
         for k in candidate.effects:
             own = slice(self.first[k], self.first[k + 1])
             place = slice(first, first + own.stop - own.start)
-            first, z = place.stop, np.asarray(x)
-            for other in traded(self.pairs[k][0], self.parameters[own], self.each[own], z[place]):
-                points.append(jax.device_put(np.concatenate([z[: place.start], other, z[place.stop :]])))
-        return points
+            points += traded(self.pairs[k][0], self.parameters[own], self.each[own], np.asarray(x), place)
+            first = place.stop
+        return [jax.device_put(point) for point in points]
 
     def replay(
         self, candidate: Candidate, x: Float[Array, " k"], shots: Shots, delta: Float[Array, " n"] | float = 0.0
@@ -331,15 +330,23 @@ def begin_value(p: EffectParameter, share: float = 1.0) -> float:
 
 
 def traded(
-    effect: Any, parameters: Sequence[EffectParameter], margins: Sequence[Margin], z: Sequence[float] | np.ndarray
-) -> list[Float[np.ndarray, " e"]]:
-    """The z of other numbers of an effect that do much the same as these."""
+    effect: Any,
+    parameters: Sequence[EffectParameter],
+    margins: Sequence[Margin],
+    x: Float[np.ndarray, " k"],
+    place: slice,
+) -> list[Float[np.ndarray, " k"]]:
+    """Points at which an effect, whose numbers stand at a place in x, has others that do much the same."""
     trade = getattr(effect, "trade", None)
     if trade is None:
         return []
-    values = {p.name: float(m.value(float(x))) for p, m, x in zip(parameters, margins, z, strict=True)}
-    named = list(zip(parameters, margins, strict=True))
-    return [np.array([m.standard(other[p.name]) for p, m in named]) for other in trade(values)]
+    values = {p.name: float(m.value(float(z))) for p, m, z in zip(parameters, margins, x[place], strict=True)}
+    points = []
+    for other in trade(values):
+        point = x.copy()
+        point[place] = [m.standard(other[p.name]) for p, m in zip(parameters, margins, strict=True)]
+        points.append(point)
+    return points
 
 
 _replay = trace_once(predict_all, static_argnames="predict", compiler_options=COMPILER_OPTIONS)

@@ -12,10 +12,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
+from bayessim_jax.diagnosis.response import Numbers
 from bayessim_jax.effects import Moment
 from bayessim_jax.effects.contract import Past
 from bayessim_jax.effects.forces import recorded_steps
@@ -24,8 +24,6 @@ from bayessim_jax.programs import trace_once
 
 __all__ = ["Joint", "Partners", "Passed", "commands_of", "force_of", "pass_on", "restore_readings"]
 
-Numbers = Array | np.ndarray
-"""What is put together on the host, or comes from a program."""
 MANY = 12
 """Parameters beyond which reverse-mode derivatives of every moment's force cost less than forward-mode ones."""
 

@@ -740,8 +740,8 @@ def _finish(
 
     def from_traded(entry: Entry) -> Entry:
         for _ in range(TURNS):
-            before, entry = entry, improve(entry, bench.traded(entry.candidate, entry.fit.z), entry.fit.sigma)
-            if entry is before:
+            last, entry = entry, improve(entry, bench.traded(entry.candidate, entry.fit.z), entry.fit.sigma)
+            if entry is last:
                 break
         return entry
 

@@ -32,6 +32,7 @@ __all__ = [
     "Forcing",
     "Linearized",
     "Motion",
+    "Numbers",
     "Readings",
     "Rest",
     "Ways",

@@ -498,14 +498,13 @@ class _Pushes:
 
         response = CAUTION / np.asarray(joint.inertia)
         along = np.moveaxis(steps(self.along[..., dof, :]), -1, 0)
-        partners = Partners(own, response * along, np.zeros_like(along))
-        acceleration = joint.acceleration + response * steps(self.force[..., dof])
-        drive = np.asarray(joint.drive)
+        acceleration = np.asarray(joint.acceleration) + response * steps(self.force[..., dof])
+        drive, drive_along = np.asarray(joint.drive), np.zeros_like(along)
         if dof in self.drives:
             more, slopes = self.drives[dof]
-            drive = drive + steps(more)
-            partners = dataclasses.replace(partners, drive=np.moveaxis(steps(slopes), -1, 0))
-        return dataclasses.replace(joint, acceleration=np.asarray(acceleration), drive=drive), partners
+            drive, drive_along = drive + steps(more), np.moveaxis(steps(slopes), -1, 0)
+        there = dataclasses.replace(joint, acceleration=acceleration, drive=drive)
+        return there, Partners(own, response * along, drive_along)
 
 
 @dataclass(frozen=True, eq=False)

@@ -308,8 +308,7 @@ class Screen:
         """Go on from other numbers that do much the same as those found, as long as that is better."""
 
         def trade(p: np.ndarray, k: int, place: slice) -> list[np.ndarray]:
-            others = traded(self.pairs[k][0], self.scene.parameters[k], self.scene.margin[k], p[place])
-            return [np.concatenate([p[: place.start], z, p[place.stop :]]) for z in others]
+            return traded(self.pairs[k][0], self.scene.parameters[k], self.scene.margin[k], p, place)
 
         for k, place in self.offsets(candidate):
             end = self._leap(candidate, end, sigma, partial(trade, k=k, place=place))
