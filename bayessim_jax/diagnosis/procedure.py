@@ -333,7 +333,7 @@ class _Growth:
     def extend(self, known: Screened) -> list[Screened]:
         """The best sets of the known effects and another one, or with one of them on each actuator by itself."""
         first = self.screens[0]
-        wider = {known.candidate + Candidate((k,)): k for k in range(len(first.pairs))}
+        wider = {known.candidate + Candidate((k,)): k for k in first.reach(known)}
         larger = len(known.candidate.effects) + 1
         tried = [
             s
@@ -430,7 +430,7 @@ def _rank(
     screens: Sequence[Screen], nothing: Screened, say: Callable[[str], None]
 ) -> tuple[list[Screened], list[Begun]]:
     """The best single effects, and all that could be begun; both the best first."""
-    singles = [Candidate((k,)) for k in range(len(screens[0].pairs)) if screens[0].takes(Candidate((k,)))]
+    singles = [Candidate((k,)) for k in screens[0].reach(nothing) if screens[0].takes(Candidate((k,)))]
     done = count(1)
 
     def begin(screen: Screen, candidate: Candidate) -> Begun | None:

@@ -38,10 +38,13 @@ __all__ = [
     "Ways",
     "Windowed",
     "assess",
+    "bound_gains",
     "cross_validate",
     "differ",
     "expand_response",
     "find_gaps",
+    "find_heavier",
+    "move_steps",
     "propose",
     "respond",
     "weigh",
@@ -49,6 +52,8 @@ __all__ = [
 
 LONGEST = 1.0
 """The longest step of p, but for steps back from an end."""
+EASY = 1e-6
+"""Precision of forces that may be any, to what they move on average."""
 Numbers = Array | np.ndarray
 """What is put together on the host, or comes from a program."""
 
@@ -78,6 +83,8 @@ class Linearized:
     """Along θ's z and the model's own parameters of a candidate."""
     gap: Float[Array, "windows steps n"]
     """F(x̄_t, u_t; θ) − x̄_{t+1}."""
+    heavier: Float[Array, "windows steps d nv nv"] | None = None
+    """W in b(θ + Δ) = b(θ) (I + Σ Δ_j W_j)⁻¹: what withstands forces grows linearly with masses."""
 
 
 @struct.dataclass
@@ -205,12 +212,17 @@ class Ways:
 
 @partial(jax.jit, static_argnames="central", compiler_options=COMPILER_OPTIONS)
 def differ(
-    lin: Linearized | None, gaps: Float[Array, "k windows steps n"], ways: Ways, forced: bool, central: bool
+    lin: Linearized | None,
+    gaps: Float[Array, "k windows steps n"],
+    ways: Ways,
+    forced: bool,
+    shift: Float[Numbers, " d"],
+    central: bool,
 ) -> Linearized:
     """Linearized steps by differences of `gaps`.
 
-    With `lin` only what a candidate's own parameters do is new, and what forces do if it is `forced`; the rest is as
-    it was linearized elsewhere.
+    With `lin` only what a candidate's own parameters do is new, and what forces do: found anew if it is `forced`, and
+    otherwise as θ's `shift` from there makes it. The rest is as it was linearized there.
     """
     gap = gaps[0]
     ahead, behind = (gaps[1::2], gaps[2::2]) if central else (gaps[1:], gap[None] + jnp.zeros((len(gaps) - 1, 1, 1, 1)))
@@ -223,7 +235,34 @@ def differ(
     along = along.at[..., ways.places].set(slopes(ways.own), mode="drop")
     if lin is None:
         return Linearized(slopes(ways.state), slopes(ways.force), along, gap)
-    return Linearized(lin.a, jnp.where(forced, slopes(ways.force), lin.b), along, gap)
+    b = jnp.where(forced, slopes(ways.force), _weigh_down(lin, shift))
+    return Linearized(lin.a, b, along, gap, lin.heavier)
+
+
+@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
+def move_steps(lin: Linearized, gap: Float[Array, "windows steps n"], shift: Float[Numbers, " d"]) -> Linearized:
+    """Linearized steps where only θ is another, by `shift`, and the `gap` with it."""
+    return Linearized(lin.a, _weigh_down(lin, shift), lin.along, gap, lin.heavier)
+
+
+def _weigh_down(lin: Linearized, shift: Float[Numbers, " d"]) -> Float[Array, "windows steps n nv"]:
+    """What forces do at θ beside where the steps were linearized."""
+    if lin.heavier is None:
+        return lin.b
+    grown = jnp.eye(lin.b.shape[-1]) + jnp.einsum("wtdij,d->wtij", lin.heavier, shift)
+    return jnp.swapaxes(jnp.linalg.solve(jnp.swapaxes(grown, -1, -2), jnp.swapaxes(lin.b, -1, -2)), -1, -2)
+
+
+@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
+def find_heavier(
+    lin: Linearized, gaps: Float[Array, "d k windows steps n"], width: Float[Numbers, " nv"], by: Float[Numbers, " d"]
+) -> Float[Array, "windows steps d nv nv"]:
+    """`Linearized.heavier` from gaps with each θ larger by so much: without a force, and with one of a width each."""
+    nv = len(width)
+    there = (gaps[:, 1 : nv + 1] - gaps[:, :1]) / width[:, None, None, None]
+    there = jnp.transpose(there[..., nv:], (2, 3, 0, 4, 1))
+    found = (jnp.linalg.solve(there, lin.b[..., None, nv:, :]) - jnp.eye(nv)) / by[:, None, None]
+    return jnp.where(jnp.isfinite(found), found, 0.0)
 
 
 def _see(
@@ -350,6 +389,57 @@ def expand_response(
     d = rest.slopes.shape[1] - delta.shape[-1]
     own = jnp.pad(own, ((0, 0), (0, moved.size - d - own.shape[1]), (0, 0)))
     return r.reshape(windowed.y.shape), jnp.concatenate([rest.slopes[:, :d], own, rest.slopes[:, d:]], 1)
+
+
+@partial(jax.jit, static_argnames="pieces", compiler_options=COMPILER_OPTIONS)
+def bound_gains(
+    lin: Linearized,
+    rest: Rest,
+    windowed: Windowed,
+    forcing: Forcing,
+    moved: Float[Array, " k"],
+    p: Float[Array, " k"],
+    delta: Float[Array, "windows n"],
+    sigma: Float[Array, " obs"],
+    pieces: int,
+) -> Float[Array, " nv"]:
+    """By how much the cost falls if any force acts on one degree of freedom, for each: no effect does better there.
+
+    The force is constant in so many pieces of every window; θ, the candidate's x and initial states give way to it.
+    """
+    r, own, rest = _foresee(lin, rest, windowed, forcing, moved, delta, sigma)
+    (count, steps, n), nv = lin.gap.shape, lin.b.shape[-1]
+    d = rest.slopes.shape[1] - n
+    held = jnp.arange(steps)[:, None] * pieces // steps == jnp.arange(pieces)
+    added = jnp.einsum("wtnv,tb->wtnvb", lin.b, held).reshape(count, steps, n, -1)
+    seen = _see(lin, windowed, jnp.zeros((count, n, nv * pieces)), added)
+    scale = 1.0 if forcing.readings is None else forcing.readings.scale
+    weight = scale * jnp.where(windowed.measured, 1.0 / sigma, 0.0)
+    pushed = (seen * weight[..., None]).reshape(count, -1, nv, pieces)
+    size = jnp.sqrt((pushed**2).sum((0, 1, 3)) / (count * pieces))
+    pushed = pushed / jnp.maximum(size, 1e-30)[:, None]
+    shared = jnp.concatenate([rest.slopes[:, :d], own], 1)
+    point, states = p[: shared.shape[1]], delta / windowed.spread
+    alike = jnp.einsum("wik,wjk->ij", shared, shared) + jnp.eye(len(point))
+    pull = jnp.einsum("wik,wk->i", shared, r) - point
+
+    def gain(own: Float[Array, "windows m rowsobs"], prior: Float[Array, " m"], at: Float[Array, "windows m"]) -> Array:
+        """By how much the cost falls in a step of Gauss and Newton along what is shared and what windows have."""
+        alone = jnp.einsum("wik,wjk->wij", own, own) + jnp.diag(prior)
+        toward = jnp.einsum("wik,wjk->wij", own, shared)
+        gradient = jnp.einsum("wik,wk->wi", own, r) - prior * at
+        solved = jnp.linalg.solve(alone, jnp.concatenate([toward, gradient[..., None]], -1))
+        hessian = alike - jnp.einsum("wmi,wmj->ij", toward, solved[..., :-1])
+        slope = pull - jnp.einsum("wmi,wm->i", toward, solved[..., -1])
+        return 0.5 * (jnp.vdot(gradient, solved[..., -1]) + slope @ jnp.linalg.solve(hessian, slope))
+
+    def under(force: Float[Array, "windows rowsobs pieces"]) -> Array:
+        columns = jnp.concatenate([rest.slopes[:, d:], jnp.moveaxis(force, 1, 2)], 1)
+        prior = jnp.concatenate([jnp.ones(n), jnp.full(pieces, EASY)])
+        return gain(columns, prior, jnp.pad(states, ((0, 0), (0, pieces))))
+
+    still = gain(rest.slopes[:, d:], jnp.ones(n), states)
+    return jax.lax.map(under, jnp.moveaxis(pushed, 2, 0)) - still
 
 
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)

@@ -31,9 +31,12 @@ from bayessim_jax.diagnosis.response import (
     Ways,
     Windowed,
     assess,
+    bound_gains,
     differ,
     expand_response,
     find_gaps,
+    find_heavier,
+    move_steps,
     respond,
     weigh,
 )
@@ -54,10 +57,16 @@ FINE = 4
 """Most time steps in a row at which effects are evaluated."""
 MOVED = 0.15
 """How far θ's z and parameters of effects on the model may move before it is found anew where the steps lead."""
+TOGETHER = 8
+"""Points beside a motion in a program."""
+AWAY = 0.1
+"""Of θ's z, for how what withstands forces grows with it."""
 HOMES = 8
 """Points around which the steps were linearized that are kept."""
 NOISES = 3
 """Of each of them the last ones for which the response is kept over σ."""
+PIECES, LITTLE = 16, 0.3
+"""Of a window, in which a force that may be any is constant; and share of what one explains where it explains most."""
 FEW = 3
 """Parameters of most candidates: programs with room for no more are as many times faster."""
 
@@ -149,6 +158,20 @@ class Scene(CandidatesOf):
         around, forcing, moved = self._force(candidate, p)
         rest = self._weigh(around, sigma)
         return expand_response(around.lin, rest, around.windowed, forcing, moved, delta, sigma)
+
+    def reach(
+        self, candidate: Candidate, p: Float[np.ndarray, " k"], delta: Float[Array, "windows n"], sigma: Array
+    ) -> list[int]:
+        """Pairs that may explain much of what a fit leaves: no forces on a joint where any force would do little."""
+        around, forcing, moved = self._force(candidate, p)
+        seen = (around.lin, self._weigh(around, sigma), around.windowed, forcing, moved)
+        gains = np.asarray(bound_gains(*seen, p, delta, sigma, pieces=PIECES))
+        enough = ~(gains < LITTLE * gains.max())
+        forced = [
+            effect.port in ("act", "force") and site.joint >= 0
+            for (effect, _), site in zip(self.pairs, self.sites, strict=True)
+        ]
+        return [k for k, site in enumerate(self.sites) if not forced[k] or enough[self._dof(site.joint)]]
 
     def _weigh(self, around: _Around, sigma: Array) -> Rest:
         """How readings over σ move with θ's z and initial states."""
@@ -243,10 +266,17 @@ class Scene(CandidatesOf):
     ) -> _Around:
         """Where the steps lead at a point; most derivatives are those of a `base`, if there is one."""
         moves = [i for k, place in self.offsets(candidate) if k in self.edits for i in range(place.start, place.stop)]
-        forced = base is None or any(self.pairs[k][0].port in ("force", "act") for k in candidate.effects)
-        count, beside, ways = self._look_beside(candidate, p, moves, forced, base is None)
-        gaps = find_gaps(self.engine, self.numbers, motion, beside, count, self.system.substeps)
-        lin = differ(base.lin if base else None, gaps, ways, forced, self.step > 0.0)
+        exerts = any(self.pairs[k][0].port in ("force", "act") for k in candidate.effects)
+        forced = base is None or (exerts and bool(moves))
+        shift = self._theta(p) - self._theta(base.p) if base else np.zeros(self.d)
+        if base is None or moves or base.edits:
+            count, beside, ways = self._look_beside(candidate, p, moves, forced, base is None)
+            gaps = self._find_gaps(motion, beside, count)
+            lin = differ(base.lin if base else None, gaps, ways, forced, shift, self.step > 0.0)
+        else:
+            lin = move_steps(base.lin, self._find_gaps(motion, self._stay(candidate, p, 1), 1)[0], shift)
+        if base is None and self.d:
+            lin = dataclasses.replace(lin, heavier=self._find_heavier(candidate, p, motion, lin))
         kept, windowed = np.where(self._steps(candidate), p, 0.0), self._windowed(p, motion)
         shared, weighed = (base.shared, base.weighed) if base else (respond(lin, windowed, self.d), {})
         return _Around(self._edits(candidate), kept, motion, lin, windowed, shared, weighed)
@@ -260,12 +290,11 @@ class Scene(CandidatesOf):
         velocity by about `length`; along the state and θ if the steps are linearized as a `whole`.
         """
         d, nv, m, length = self.d, self.model.nv, len(moves), self.length
-        rise = self.system.dt * np.maximum(self.model.dof_invweight0, 1e-12)
         width = np.full(self.slots + 3 * nv + d, length)
-        width[m : m + nv] = length / rise
+        width[m : m + nv] = self._pushing
         sides = (1.0, -1.0) if self.step else (1.0,)
-        points = np.tile(self._full(candidate, p), (1 + len(sides) * len(width), 1))
-        move, force = np.zeros((len(points), 2 * nv)), np.zeros((len(points), nv))
+        beside = self._stay(candidate, p, 1 + len(sides) * len(width))
+        points, move, force = beside.x, beside.move, beside.force
         for k, side in enumerate(sides, 1):
             rows = k + len(sides) * np.arange(len(width))
             for row, i in zip(rows, moves, strict=False):
@@ -278,7 +307,40 @@ class Scene(CandidatesOf):
         after = m + np.arange(3 * nv + d)
         used = m + nv * forced + (2 * nv + d) * whole
         ways = Ways(len(sides) * width, own, places, after[:nv], after[nv : 3 * nv], after[3 * nv :])
-        return 1 + len(sides) * used, Beside(points, move, force), ways
+        return 1 + len(sides) * used, beside, ways
+
+    def _stay(self, candidate: Candidate, p: Float[np.ndarray, " k"], count: int) -> Beside:
+        """So many points that lie on the motion and have no force."""
+        nv = self.model.nv
+        return Beside(np.tile(self._full(candidate, p), (count, 1)), np.zeros((count, 2 * nv)), np.zeros((count, nv)))
+
+    def _find_gaps(self, motion: Motion, beside: Beside, count: int) -> Float[Array, "k windows steps n"]:
+        """Where steps from the first `count` points lead, by one program for few points and many; 0 for the others."""
+        found = []
+        for first in range(0, len(beside.x), TOGETHER):
+            some = jax.tree.map(lambda x: np.resize(x[first : first + TOGETHER], (TOGETHER, x.shape[1])), beside)  # noqa: B023
+            here = min(max(count - first, 0), len(beside.x) - first)
+            found.append(find_gaps(self.engine, self.numbers, motion, some, here, self.system.substeps))
+        return jnp.concatenate(found)[: len(beside.x)] if len(found) > 1 else found[0]
+
+    @property
+    def _pushing(self) -> Float[np.ndarray, " nv"]:
+        """Forces that move a velocity by about `length` in a row."""
+        return self.length / (self.system.dt * np.maximum(self.model.dof_invweight0, 1e-12))
+
+    def _find_heavier(self, candidate: Candidate, p: Float[np.ndarray, " k"], motion: Motion, lin: Linearized) -> Array:
+        """How what withstands forces grows with θ, from where each by itself is a little nearer to its usual value."""
+        nv, every, by = self.model.nv, [], []
+        for j in range(self.d):
+            there = p - np.copysign(AWAY, p[j]) * (np.arange(p.size) == j)
+            beside = self._stay(candidate, there, 1 + nv)
+            np.asarray(beside.force)[1:] = np.diag(self._pushing)
+            every.append(self._find_gaps(motion, beside, 1 + nv)[: 1 + nv])
+            by.append(self._theta(there)[j] - self._theta(p)[j])
+        return find_heavier(lin, jnp.stack(every), self._pushing, np.array(by))
+
+    def _theta(self, p: Float[np.ndarray, " k"]) -> Float[np.ndarray, " d"]:
+        return np.asarray(self.margins.theta(np.asarray(p[: self.d])))
 
     def _find_around(self, candidate: Candidate, p: Float[np.ndarray, " k"], motion: Motion) -> _Around:
         """Steps around the motion: those of before, where neither the motion nor the model has changed much."""

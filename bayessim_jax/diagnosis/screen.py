@@ -202,6 +202,11 @@ class Screen:
             raise ValueError("the simulator diverges along the recorded motion.")
         return found
 
+    def reach(self, known: Screened) -> list[int]:
+        """Effects that may explain much of what a fit leaves."""
+        self.scene.begin_around(known.candidate, known.p)
+        return self.scene.reach(known.candidate, np.asarray(known.p), known.delta, known.sigma)
+
     def begin_candidate(self, candidate: Candidate, known: Screened) -> Begun | None:
         """Take the first steps with a candidate from several points beside a fit without it.
 

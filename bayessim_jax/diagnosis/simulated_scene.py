@@ -107,6 +107,12 @@ class SimulatedScene(CandidatesOf):
         axes: Any = (0, None, None, None, None, None)
         return dataclasses.replace(self.shots, inputs=Chosen(self.shots.inputs, *given), axes=Chosen(*axes))
 
+    def reach(
+        self, candidate: Candidate, p: Float[np.ndarray, " k"], delta: Float[Array, "windows n"], sigma: Array
+    ) -> list[int]:
+        """Pairs that may matter beside a candidate: all."""
+        return list(range(len(self.pairs)))
+
     def states(self, delta: Float[Array, "windows n"]) -> list[Float[Array, "windows n"]]:
         """Initial states to begin from: those of a fit, and the recorded ones, which no misfit has moved."""
         return [delta, jnp.zeros_like(delta)]

@@ -14,9 +14,12 @@ from bayessim_jax.diagnosis.response import (
     Ways,
     Windowed,
     assess,
+    bound_gains,
     cross_validate,
     differ,
     find_gaps,
+    find_heavier,
+    move_steps,
     respond,
     separate,
     weigh,
@@ -90,7 +93,7 @@ def linearize(arm, motion, theta, length=1e-6, central=False):
     gaps = find_gaps(arm.engine, _same, motion, beside, len(ways), 2)
     nothing = jnp.zeros(1, int), jnp.array([9])
     along = Ways(jnp.full(count, len(sides) * length), *nothing, jnp.arange(2), 2 + jnp.arange(4), 6 + jnp.arange(d))
-    return differ(None, gaps, along, True, central)
+    return differ(None, gaps, along, True, np.zeros(d), central)
 
 
 def test_slopes_of_steps_are_their_derivatives():
@@ -134,13 +137,60 @@ def test_where_steps_lead_is_found_without_linearizing_them():
         jnp.zeros(0, int),
         jnp.zeros(1, int),
     )
-    found = differ(here, gaps, ways, True, False)
+    found = differ(here, gaps, ways, True, np.zeros(1), False)
     np.testing.assert_allclose(found.gap, there.gap, atol=1e-12)
     np.testing.assert_allclose(found.along[..., 1], there.along[..., 0], rtol=1e-3, atol=1e-6)
     np.testing.assert_allclose(found.b[..., 1], there.b[..., 1], rtol=1e-3, atol=1e-6)
     np.testing.assert_array_equal(found.a, here.a)
     np.testing.assert_array_equal(found.along[..., 0], here.along[..., 0])
-    np.testing.assert_array_equal(differ(here, gaps, ways, False, False).b, here.b)
+    np.testing.assert_array_equal(differ(here, gaps, ways, False, np.zeros(1), False).b, here.b)
+
+
+def test_what_forces_do_is_known_where_masses_are_far_from_those_of_before():
+    """Also with damping, which the integrator treats implicitly."""
+    unknown = [Unknown("mass", ("body/low/mass",), 0.1, 2.0), Unknown("damping", ("joint/a/damping",), 0.0, 1.0)]
+    arm = mjcf_system(DOUBLE.replace("<body pos", '<body name="low" pos'), unknown, substeps=2)
+    motion, width = random_motion(), np.array([1e-4, 1e-5])
+    here, there = (linearize(arm, motion, theta) for theta in ([0.3, 0.1], [1.2, 0.5]))
+    every, by = [], np.array([0.02, -0.01])
+    for j in range(2):
+        points = np.tile(np.array([0.3, 0.1]) + by * (np.arange(2) == j), (3, 1))
+        force = np.concatenate([np.zeros((1, 2)), np.diag(width)])
+        every.append(find_gaps(arm.engine, _same, motion, Beside(points, np.zeros((3, 4)), force), 3, 2))
+    here = here.replace(heavier=find_heavier(here, jnp.stack(every), width, by))
+    moved = move_steps(here, there.gap, np.array([0.9, 0.4]))
+    size = np.abs(there.b).max()
+    assert np.abs(here.b - there.b).max() > 0.5 * size
+    np.testing.assert_allclose(moved.b, there.b, atol=5e-3 * size)
+    np.testing.assert_array_equal(moved.gap, there.gap)
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_no_force_explains_more_than_any_force_on_its_joint(arm, joint):
+    """A force that is held for whole pieces is explained, and on the other joint less of it is."""
+    ctrl, start = jnp.zeros((STEPS, 1)), (jnp.array([0.6, -0.4]), jnp.array([1.0, -2.0]))
+    plain = simulate(arm, *start, ctrl, jnp.zeros((STEPS, 2)))
+    shape = jnp.repeat(jnp.array([1.0, -2.0, 0.5, 0.0, 1.5, -1.0]), STEPS // 6)
+    push = 1e-4 * shape[:, None] * (jnp.arange(2) == joint)
+    motion = Motion(plain[None, :, :2], plain[None, :, 2:], ctrl[None], jnp.zeros((1, 0, 1)), jnp.zeros(1))
+    lin = linearize(arm, motion, [])
+    seen = Windowed(
+        simulate(arm, *start, ctrl, push)[None],
+        jnp.ones((1, STEPS + 1, 4), bool),
+        plain[None],
+        jnp.eye(4) * jnp.ones((1, STEPS + 1, 1, 1)),
+        jnp.full(4, 1e-9),
+    )
+    sigma, nothing = jnp.full(4, 1e-6), Forcing(jnp.zeros((1, STEPS, 2)), jnp.zeros((1, STEPS, 2, 1)))
+    rest = weigh(respond(lin, seen, 0), seen, sigma)
+    at = jnp.zeros(1), jnp.zeros(1), jnp.zeros((1, 4)), sigma
+    before = assess(lin, rest, seen, nothing, *at)[0].cost
+    gains = np.asarray(bound_gains(lin, rest, seen, nothing, *at, pieces=6))
+    assert gains[joint] == pytest.approx(float(before), rel=1e-2)
+    assert gains[1 - joint] < 0.99 * gains[joint]
+    one = Forcing(push[None], jnp.zeros((1, STEPS, 2, 1)))
+    explained = float(before - assess(lin, rest, seen, one, *at)[0].cost)
+    assert explained <= 1.001 * gains[joint]
 
 
 def _same(x):
