@@ -66,7 +66,8 @@ HOMES = 8
 NOISES = 3
 """Of each of them the last ones for which the response is kept over σ."""
 PIECES, LITTLE = 16, 0.3
-"""Of a window, in which a force that may be any is constant; and share of what one explains where it explains most."""
+"""Of a window, in which a force that may be any is constant; and share of what one explains, beyond noise, where it
+explains most."""
 FEW = 3
 """Parameters of most candidates: programs with room for no more are as many times faster."""
 
@@ -166,7 +167,10 @@ class Scene(CandidatesOf):
         around, forcing, moved = self._force(candidate, p)
         seen = (around.lin, self._weigh(around, sigma), around.windowed, forcing, moved)
         gains = np.asarray(bound_gains(*seen, p, delta, sigma, pieces=PIECES))
-        enough = ~(gains < LITTLE * gains.max())
+        # of noise alone: half of χ² with a degree of freedom for every piece
+        noise = 0.5 * PIECES * len(delta)
+        excess, sd = gains - noise, np.sqrt(noise)
+        enough = ~(excess < LITTLE * excess.max() - 2.0 * sd) | ~(excess.max() > 3.0 * sd)
         forced = [
             effect.port in ("act", "force") and site.joint >= 0
             for (effect, _), site in zip(self.pairs, self.sites, strict=True)
