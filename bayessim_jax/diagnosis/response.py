@@ -423,20 +423,22 @@ def bound_gains(
     alike = jnp.einsum("wik,wjk->ij", shared, shared) + jnp.eye(len(point))
     pull = jnp.einsum("wik,wk->i", shared, r) - point
 
-    def gain(own: Float[Array, "windows m rowsobs"], prior: Float[Array, " m"], at: Float[Array, "windows m"]) -> Array:
-        """By how much the cost falls in a step of Gauss and Newton along what is shared and what windows have."""
-        alone = jnp.einsum("wik,wjk->wij", own, own) + jnp.diag(prior)
-        toward = jnp.einsum("wik,wjk->wij", own, shared)
-        gradient = jnp.einsum("wik,wk->wi", own, r) - prior * at
-        solved = jnp.linalg.solve(alone, jnp.concatenate([toward, gradient[..., None]], -1))
-        hessian = alike - jnp.einsum("wmi,wmj->ij", toward, solved[..., :-1])
-        slope = pull - jnp.einsum("wmi,wm->i", toward, solved[..., -1])
+    def gain(
+        free: Float[Array, "windows m rowsobs"], prior: Float[Array, " m"], at: Float[Array, "windows m"]
+    ) -> Array:
+        """By how much the cost falls in a step of Gauss and Newton along what is shared and what each window has."""
+        alone = jnp.einsum("wik,wjk->wij", free, free) + jnp.diag(prior)
+        beside = jnp.einsum("wik,wjk->wij", free, shared)
+        gradient = jnp.einsum("wik,wk->wi", free, r) - prior * at
+        solved = jnp.linalg.solve(alone, jnp.concatenate([beside, gradient[..., None]], -1))
+        hessian = alike - jnp.einsum("wmi,wmj->ij", beside, solved[..., :-1])
+        slope = pull - jnp.einsum("wmi,wm->i", beside, solved[..., -1])
         return 0.5 * (jnp.vdot(gradient, solved[..., -1]) + slope @ jnp.linalg.solve(hessian, slope))
 
     def under(force: Float[Array, "windows rowsobs pieces"]) -> Array:
-        columns = jnp.concatenate([rest.slopes[:, d:], jnp.moveaxis(force, 1, 2)], 1)
+        free = jnp.concatenate([rest.slopes[:, d:], jnp.moveaxis(force, 1, 2)], 1)
         prior = jnp.concatenate([jnp.ones(n), jnp.full(pieces, EASY)])
-        return gain(columns, prior, jnp.pad(states, ((0, 0), (0, pieces))))
+        return gain(free, prior, jnp.pad(states, ((0, 0), (0, pieces))))
 
     still = gain(rest.slopes[:, d:], jnp.ones(n), states)
     return jax.lax.map(under, jnp.moveaxis(pushed, 2, 0)) - still
