@@ -212,17 +212,12 @@ class Ways:
 
 @partial(jax.jit, static_argnames="central", compiler_options=COMPILER_OPTIONS)
 def differ(
-    lin: Linearized | None,
-    gaps: Float[Array, "k windows steps n"],
-    ways: Ways,
-    forced: bool,
-    shift: Float[Numbers, " d"],
-    central: bool,
+    lin: Linearized | None, gaps: Float[Array, "k windows steps n"], ways: Ways, forced: bool, central: bool
 ) -> Linearized:
     """Linearized steps by differences of `gaps`.
 
-    With `lin` only what a candidate's own parameters do is new, and what forces do: found anew if it is `forced`, and
-    otherwise as θ's `shift` from there makes it. The rest is as it was linearized there.
+    With `lin` only what a candidate's own parameters do is new, and what forces do if it is `forced`; the rest is as
+    it was linearized elsewhere.
     """
     gap = gaps[0]
     ahead, behind = (gaps[1::2], gaps[2::2]) if central else (gaps[1:], gap[None] + jnp.zeros((len(gaps) - 1, 1, 1, 1)))
@@ -235,22 +230,17 @@ def differ(
     along = along.at[..., ways.places].set(slopes(ways.own), mode="drop")
     if lin is None:
         return Linearized(slopes(ways.state), slopes(ways.force), along, gap)
-    b = jnp.where(forced, slopes(ways.force), _weigh_down(lin, shift))
-    return Linearized(lin.a, b, along, gap, lin.heavier)
+    return Linearized(lin.a, jnp.where(forced, slopes(ways.force), lin.b), along, gap)
 
 
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)
 def move_steps(lin: Linearized, gap: Float[Array, "windows steps n"], shift: Float[Numbers, " d"]) -> Linearized:
-    """Linearized steps where only θ is another, by `shift`, and the `gap` with it."""
-    return Linearized(lin.a, _weigh_down(lin, shift), lin.along, gap, lin.heavier)
-
-
-def _weigh_down(lin: Linearized, shift: Float[Numbers, " d"]) -> Float[Array, "windows steps n nv"]:
-    """What forces do at θ beside where the steps were linearized."""
+    """Linearized steps where only θ is another, by `shift`, and the `gap` with it; forces do what `heavier` says."""
     if lin.heavier is None:
-        return lin.b
+        return Linearized(lin.a, lin.b, lin.along, gap)
     grown = jnp.eye(lin.b.shape[-1]) + jnp.einsum("wtdij,d->wtij", lin.heavier, shift)
-    return jnp.swapaxes(jnp.linalg.solve(jnp.swapaxes(grown, -1, -2), jnp.swapaxes(lin.b, -1, -2)), -1, -2)
+    turned = jnp.linalg.solve(jnp.swapaxes(grown, -1, -2), jnp.swapaxes(lin.b, -1, -2))
+    return Linearized(lin.a, jnp.swapaxes(turned, -1, -2), lin.along, gap, lin.heavier)
 
 
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)

@@ -59,8 +59,8 @@ MOVED = 0.15
 """How far θ's z and parameters of effects on the model may move before it is found anew where the steps lead."""
 TOGETHER = 8
 """Points beside a motion in a program."""
-AWAY = 0.1
-"""Of θ's z, for how what withstands forces grows with it."""
+AWAY = 1.0
+"""Of θ's z at least, for how what withstands forces grows with it."""
 HOMES = 8
 """Points around which the steps were linearized that are kept."""
 NOISES = 3
@@ -271,14 +271,15 @@ class Scene(CandidatesOf):
         """Where the steps lead at a point; most derivatives are those of a `base`, if there is one."""
         moves = [i for k, place in self.offsets(candidate) if k in self.edits for i in range(place.start, place.stop)]
         exerts = any(self.pairs[k][0].port in ("force", "act") for k in candidate.effects)
-        forced = base is None or (exerts and bool(moves))
-        shift = self._theta(p) - self._theta(base.p) if base else np.zeros(self.d)
-        if base is None or moves or base.edits:
+        lin = None
+        if base and not moves and not base.edits:
+            gap = self._find_gaps(motion, self._stay(candidate, p, 1), 1)[0]
+            lin = move_steps(base.lin, gap, self._theta(p) - self._theta(base.p))
+        if lin is None or not _gives_way(lin, self.model.nv):
+            forced = base is None or exerts
             count, beside, ways = self._look_beside(candidate, p, moves, forced, base is None)
             gaps = self._find_gaps(motion, beside, count)
-            lin = differ(base.lin if base else None, gaps, ways, forced, shift, self.step > 0.0)
-        else:
-            lin = move_steps(base.lin, self._find_gaps(motion, self._stay(candidate, p, 1), 1)[0], shift)
+            lin = differ(base.lin if base else None, gaps, ways, forced, self.step > 0.0)
         if base is None and self.d:
             lin = dataclasses.replace(lin, heavier=self._find_heavier(candidate, p, motion, lin))
         kept, windowed = np.where(self._steps(candidate), p, 0.0), self._windowed(p, motion)
@@ -325,7 +326,7 @@ class Scene(CandidatesOf):
             some = jax.tree.map(lambda x: np.resize(x[first : first + TOGETHER], (TOGETHER, x.shape[1])), beside)  # noqa: B023
             here = min(max(count - first, 0), len(beside.x) - first)
             found.append(find_gaps(self.engine, self.numbers, motion, some, here, self.system.substeps))
-        return jnp.concatenate(found)[: len(beside.x)] if len(found) > 1 else found[0]
+        return (jnp.concatenate(found) if len(found) > 1 else found[0])[: len(beside.x)]
 
     @property
     def _pushing(self) -> Float[np.ndarray, " nv"]:
@@ -333,12 +334,13 @@ class Scene(CandidatesOf):
         return self.length / (self.system.dt * np.maximum(self.model.dof_invweight0, 1e-12))
 
     def _find_heavier(self, candidate: Candidate, p: Float[np.ndarray, " k"], motion: Motion, lin: Linearized) -> Array:
-        """How what withstands forces grows with θ, from where each by itself is a little nearer to its usual value."""
+        """How what withstands forces grows with θ, from where each by itself is at or towards its usual value."""
         nv, every, by = self.model.nv, [], []
         for j in range(self.d):
-            there = p - np.copysign(AWAY, p[j]) * (np.arange(p.size) == j)
-            beside = self._stay(candidate, there, 1 + nv)
-            np.asarray(beside.force)[1:] = np.diag(self._pushing)
+            away = np.copysign(max(AWAY, abs(p[j])), p[j])
+            there = p - away * (np.arange(p.size) == j)
+            force = np.concatenate([np.zeros((1, nv)), np.diag(self._pushing)])
+            beside = dataclasses.replace(self._stay(candidate, there, 1 + nv), force=force)
             every.append(self._find_gaps(motion, beside, 1 + nv)[: 1 + nv])
             by.append(self._theta(there)[j] - self._theta(p)[j])
         return find_heavier(lin, jnp.stack(every), self._pushing, np.array(by))
@@ -608,6 +610,12 @@ class _EngineNumbers:
     @property
     def _key(self) -> tuple[Any, ...]:
         return self.engine, self.writes, self.margins, self.edits, self.kinds
+
+
+def _gives_way(lin: Linearized, nv: int) -> bool:
+    """Whether every joint gives way to a force on it: inertia that is not linear in θ may come out negative."""
+    along = np.einsum("...ii->...i", np.asarray(lin.b)[..., nv:, :])
+    return bool((along > 0.0).all())
 
 
 def _device(x: np.ndarray) -> Array:

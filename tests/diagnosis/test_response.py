@@ -93,7 +93,7 @@ def linearize(arm, motion, theta, length=1e-6, central=False):
     gaps = find_gaps(arm.engine, _same, motion, beside, len(ways), 2)
     nothing = jnp.zeros(1, int), jnp.array([9])
     along = Ways(jnp.full(count, len(sides) * length), *nothing, jnp.arange(2), 2 + jnp.arange(4), 6 + jnp.arange(d))
-    return differ(None, gaps, along, True, np.zeros(d), central)
+    return differ(None, gaps, along, True, central)
 
 
 def test_slopes_of_steps_are_their_derivatives():
@@ -137,13 +137,13 @@ def test_where_steps_lead_is_found_without_linearizing_them():
         jnp.zeros(0, int),
         jnp.zeros(1, int),
     )
-    found = differ(here, gaps, ways, True, np.zeros(1), False)
+    found = differ(here, gaps, ways, True, False)
     np.testing.assert_allclose(found.gap, there.gap, atol=1e-12)
     np.testing.assert_allclose(found.along[..., 1], there.along[..., 0], rtol=1e-3, atol=1e-6)
     np.testing.assert_allclose(found.b[..., 1], there.b[..., 1], rtol=1e-3, atol=1e-6)
     np.testing.assert_array_equal(found.a, here.a)
     np.testing.assert_array_equal(found.along[..., 0], here.along[..., 0])
-    np.testing.assert_array_equal(differ(here, gaps, ways, False, np.zeros(1), False).b, here.b)
+    np.testing.assert_array_equal(differ(here, gaps, ways, False, False).b, here.b)
 
 
 def test_what_forces_do_is_known_where_masses_are_far_from_those_of_before():
