@@ -27,6 +27,7 @@ from bayessim_jax.diagnosis.verdict import (
     Entry,
     Thresholds,
     are_kin,
+    are_siblings,
     can_stand_for,
     contains,
     contenders,
@@ -670,14 +671,21 @@ def _are_rivals(entry: Entry, best: Entry, none: Entry, thresholds: Thresholds) 
     return replaced and (share_left(entry.misfit, none.misfit) <= thresholds.left or has_special_case(best, entry))
 
 
-def _stand_ins(bench: Bench, candidate: Candidate) -> list[Candidate]:
-    """Sets with one effect replaced by a special case or a twin of it, as far as there is room for their parameters."""
+def _stand_ins(bench: Bench, candidate: Candidate, siblings: bool = False) -> list[Candidate]:
+    """Sets with one effect replaced by a special case or a twin of it, as far as there is room for their parameters.
+
+    Or by another law that has a special case in common with it, if `siblings` are asked for.
+    """
+
+    def stands(one: str, other: str) -> bool:
+        return can_stand_for(one, other) or (siblings and are_siblings(one, other))
+
     seats = [bench.seats(Candidate((k,))).get(bench.name(k), bench.name(k)) for k in range(len(bench.pairs))]
     found = [
         Candidate(tuple(sorted({*candidate.effects, k} - {effect})))
         for effect in candidate.effects
         for k in range(len(bench.pairs))
-        if k not in candidate.effects and can_stand_for(seats[k], seats[effect])
+        if k not in candidate.effects and stands(seats[k], seats[effect])
     ]
     return [each for each in found if len(bench.columns(each)) <= bench.slots]
 
@@ -776,12 +784,19 @@ def _finish(
             tied = contenders(entries, none, thresholds)
             if all(entry.candidate in before for entry in tied):
                 break
-            alike = [(s, entry) for entry in tied for s in _stand_ins(bench, entry.candidate) if s not in tried]
-            simpler = list({s: (s, entry) for s, entry in reversed(alike)}.values())[::-1][:AGAIN]
+            # of laws that all leave something in a set of several, which comes out best may be chance
+            vague = len(best.names) > 1 and best.misfit.p_value < FALSE_ALARMS
+            alike: dict[Candidate, Entry] = {}
+            for entry in tied:
+                for s in _stand_ins(bench, entry.candidate, siblings=vague and entry is best):
+                    if s not in tried:
+                        alike.setdefault(s, entry)
+            # all of the best one's: none is named for want of another law beside the other effects
+            simpler = list(alike.items())[: max(AGAIN, sum(entry is best for entry in alike.values()))]
             begun = [_with_numbers_of(bench, e, s, bench.starts(s, jnp.zeros(bench.d))[-1]) for s, e in simpler]
             found = pool.map(lambda pair, p: enter(pair[0], p, pair[1].fit.sigma), simpler, begun)
             entries = sorted([*entries, *(e for e in found if e is not None)], key=lambda e: -e.score)
-            rivals = [entry for entry in entries if _are_rivals(entry, best, none, thresholds)][:AGAIN]
+            rivals = [entry for entry in entries if _are_rivals(entry, best, none, thresholds)]
             rivals += [entry for entry in entries if set(entry.names) < set(best.names)]
             _replace(work, entries, zip(rivals, pool.map(partial(from_numbers_of, best), rivals), strict=True))
             now_tied = {entry.candidate for entry in contenders(entries, none, thresholds)}

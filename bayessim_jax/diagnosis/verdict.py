@@ -19,6 +19,7 @@ __all__ = [
     "Entry",
     "Thresholds",
     "are_kin",
+    "are_siblings",
     "can_stand_for",
     "contains",
     "contenders",
@@ -438,6 +439,14 @@ def can_stand_for(one: str, other: str) -> bool:
     """Whether the first effect, at the same place, is a special case of the other or a twin of it."""
     (effect, _, place), (found, _, where) = one.partition("@"), other.partition("@")
     return contains(other, one) or (place == where and effect in TWINS.get(found, ()))
+
+
+def are_siblings(one: str, other: str) -> bool:
+    """Whether two effects at the same place have a special case in common."""
+    (effect, _, place), (simpler, _, where) = one.partition("@"), other.partition("@")
+    return (
+        place == where and effect != simpler and not set(CONTAINS.get(effect, ())).isdisjoint(CONTAINS.get(simpler, ()))
+    )
 
 
 def has_special_case(entry: Entry, other: Entry) -> bool:

@@ -331,6 +331,16 @@ def test_stand_ins_take_the_place_of_effects_of_a_set(problem):
     assert _stand_ins(bench, Candidate((3, 4))) == [], "along the link it is a length"
 
 
+def test_siblings_take_the_place_of_a_law_if_they_are_asked_for(problem):
+    """Laws that have a special case in common; what is no more than that special case has none."""
+    names = ("coulomb_friction", "stribeck_friction", "load_dependent_friction", "armature")
+    bench = problem.bench([(EFFECTS[name], "joint/hinge") for name in names])
+    simpler, sibling = Candidate((0, 3)), Candidate((2, 3))
+    assert _stand_ins(bench, Candidate((1, 3))) == [simpler]
+    assert _stand_ins(bench, Candidate((1, 3)), siblings=True) == [simpler, sibling]
+    assert _stand_ins(bench, simpler, siblings=True) == []
+
+
 def test_pairs_that_are_simulated_differ_in_their_effects():
     """The best four, and two of those that come near and have an effect that none of these has."""
 
