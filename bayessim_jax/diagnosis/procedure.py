@@ -721,7 +721,8 @@ def _finish(
     joints stick and slip for instance. Where numbers trade for each other, candidates are fitted from far along that,
     too. Rivals of the best and parts of it are fitted from its numbers, and where one of them is then the best or ties
     with it, so are its own: none must win by a better start. Special cases and twins of what may be the answer are
-    tried in their places. What was fitted before is taken as it was, and what turns out to be shortsighted is left out.
+    tried in their places, and siblings of the best one's effects where it is a set that leaves something. What was
+    fitted before is taken as it was, and what turns out to be shortsighted is left out.
     """
     bench, before = work.bench, dict(work.done)
     work.say(f"simulating {sum(c.candidate not in before for c in candidates)} candidates; compiling takes a while")
