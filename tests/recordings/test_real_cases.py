@@ -130,7 +130,7 @@ def test_a_rail_lacks_viscous_friction_and_dry_friction_with_two_levels(tmp_path
 def test_geared_joints_lack_dry_friction_and_a_rotor(tmp_path):
     table, sets = diagnosed("dfki_double_pendulum", tmp_path)
     for names in sets:
-        assert {place for effect, place in names if effect in DRY} == {"joint/shoulder", "joint/elbow"}
-        assert {effect for effect, _ in names} <= DRY | {"armature"}
+        assert {place for effect, place in names if effect in DRY} == {"joint/shoulder", "joint/elbow"}, sets
+        assert {effect for effect, _ in names} <= DRY | {"armature"}, sets
     assert any(effect == "armature" for names in sets for effect, _ in names)
     assert shrinks(table, 0.25)
