@@ -690,6 +690,22 @@ def _stand_ins(bench: Bench, candidate: Candidate, siblings: bool = False) -> li
     return [each for each in found if len(bench.columns(each)) <= bench.slots]
 
 
+def _replacements(bench: Bench, tied: Sequence[Entry], tried: Collection[Candidate]) -> list[tuple[Candidate, Entry]]:
+    """What is to be tried in the places of sets that tie, the best first, and the set whose numbers each begins from.
+
+    Of the best all, so that none is named for want of another law beside its other effects, and siblings where it has
+    several and leaves something: which of laws that all do comes out best may be chance. Of the others few.
+    """
+    best = tied[0]
+    vague = len(best.names) > 1 and best.misfit.p_value < FALSE_ALARMS
+    found: dict[Candidate, Entry] = {}
+    for entry in tied:
+        for each in _stand_ins(bench, entry.candidate, siblings=vague and entry is best):
+            found.setdefault(each, entry)
+    fresh = [(each, entry) for each, entry in found.items() if each not in tried]
+    return fresh[: max(AGAIN, sum(entry is best for _, entry in fresh))]
+
+
 def _with_numbers_of(bench: Bench, best: Entry, other: Candidate, start: Float[Array, " k"]) -> Float[Array, " k"]:
     """Another candidate's point with the numbers of the best, as far as they have the same names."""
     found = dict(zip(bench.columns(best.candidate), np.asarray(best.fit.z)[bench.d :].tolist(), strict=False))
@@ -779,26 +795,21 @@ def _finish(
         _replace(work, entries, zip(again, pool.map(from_elsewhere, again), strict=True))
         trading = [e for e in entries if e.candidate not in before and bench.traded(e.candidate, e.fit.z)][:AGAIN]
         _replace(work, entries, zip(trading, pool.map(from_traded, trading), strict=True))
+        compared: set[tuple[Entry, Entry]] = set()
         for _ in range(TURNS if entries else 0):
             best = entries[0]
             tried = {entry.candidate for entry in entries}
             tied = contenders(entries, none, thresholds)
             if all(entry.candidate in before for entry in tied):
                 break
-            # of laws that all leave something in a set of several, which comes out best may be chance
-            vague = len(best.names) > 1 and best.misfit.p_value < FALSE_ALARMS
-            alike: dict[Candidate, Entry] = {}
-            for entry in tied:
-                for s in _stand_ins(bench, entry.candidate, siblings=vague and entry is best):
-                    if s not in tried:
-                        alike.setdefault(s, entry)
-            # all of the best one's: none is named for want of another law beside the other effects
-            simpler = list(alike.items())[: max(AGAIN, sum(entry is best for entry in alike.values()))]
+            simpler = _replacements(bench, tied, tried)
             begun = [_with_numbers_of(bench, e, s, bench.starts(s, jnp.zeros(bench.d))[-1]) for s, e in simpler]
             found = pool.map(lambda pair, p: enter(pair[0], p, pair[1].fit.sigma), simpler, begun)
             entries = sorted([*entries, *(e for e in found if e is not None)], key=lambda e: -e.score)
             rivals = [entry for entry in entries if _are_rivals(entry, best, none, thresholds)]
             rivals += [entry for entry in entries if set(entry.names) < set(best.names)]
+            rivals = [entry for entry in rivals if (best, entry) not in compared]
+            compared |= {(best, entry) for entry in rivals}
             _replace(work, entries, zip(rivals, pool.map(partial(from_numbers_of, best), rivals), strict=True))
             now_tied = {entry.candidate for entry in contenders(entries, none, thresholds)}
             if entries[0] is best and now_tied <= {entry.candidate for entry in tied}:

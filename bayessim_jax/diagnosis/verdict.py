@@ -443,10 +443,9 @@ def can_stand_for(one: str, other: str) -> bool:
 
 def are_siblings(one: str, other: str) -> bool:
     """Whether two effects at the same place have a special case in common."""
-    (effect, _, place), (simpler, _, where) = one.partition("@"), other.partition("@")
-    return (
-        place == where and effect != simpler and not set(CONTAINS.get(effect, ())).isdisjoint(CONTAINS.get(simpler, ()))
-    )
+    (effect, _, place), (another, _, where) = one.partition("@"), other.partition("@")
+    common = set(CONTAINS.get(effect, ())) & set(CONTAINS.get(another, ()))
+    return one != other and place == where and bool(common)
 
 
 def has_special_case(entry: Entry, other: Entry) -> bool:

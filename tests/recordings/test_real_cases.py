@@ -9,6 +9,7 @@ import pytest
 
 from bayessim_jax.cli.main import main
 from bayessim_jax.recordings.loading import load_case
+from benchmarks.thresholds import FAMILIES
 
 ROOT = Path(__file__).parents[2]
 CASES = Path(os.environ.get("BAYESSIM_CASES", ROOT.parent / "shared" / "data" / "cases"))
@@ -84,15 +85,7 @@ def test_the_geometry_of_a_real_vehicle_predicts_windows_that_were_left_out(name
     assert found["parameters"]["axial_distance"]["mean"] > 1.4
 
 
-DRY = {
-    "coulomb_friction",
-    "stribeck_friction",
-    "asymmetric_friction",
-    "load_dependent_friction",
-    "lugre_friction",
-    "hysteresis",
-}
-"""Laws of friction that holds a joint; the last two bend before they yield."""
+DRY = set(FAMILIES["dry friction"])
 
 
 def diagnosed(name, tmp_path):
