@@ -60,7 +60,9 @@ def main() -> None:
     concealed.add_argument("--cases", type=int, default=200)
     concealed.add_argument("--seed", type=int, default=1)
     concealed.add_argument("--out", type=Path, help="file of JSON lines to append cases to, and to resume from")
-
+    concealed.add_argument(
+        "--records", type=Path, nargs="+", help="files of cases: print what became of one, or a table of several"
+    )
     concealed.add_argument("--peers", action="store_true", help="name them by sparse regression (PySINDy), too")
 
     identification = commands.add_parser("identification", help="posteriors of simulated machines against mujoco.sysid")

@@ -33,6 +33,7 @@ __all__ = [
     "make_drawn",
     "resumed",
     "summarize",
+    "tabulate",
 ]
 
 GROUPS = {"single": 0.37, "weak": 0.1, "pair": 0.1, "unknown": 0.18, "clean": 0.25}
@@ -220,7 +221,11 @@ def diagnose_drawn(path: Path, case: dict[str, Any], effects: Sequence[Any] | No
 
 
 def diagnose_concealed(options: Namespace) -> None:
-    """Diagnose the cases that are not in the file yet, and print what became of all."""
+    """Diagnose the cases that are not in the file yet, and print what became of all; or that of what was recorded."""
+    if options.records:
+        sets = {path.stem: _read_judged(path) for path in options.records}
+        print(tabulate(sets) if len(sets) > 1 else summarize(*sets.values()))
+        return
     jax.config.update("jax_enable_x64", True)
 
     def make(path: Path, case: dict[str, Any]) -> dict[str, Any]:
@@ -334,6 +339,45 @@ def summarize(rows: list[dict[str, Any]]) -> str:
     seconds = np.array([row["seconds"] for row in rows])
     if len(seconds):
         lines.append(f"seconds per case: median {np.median(seconds):.0f}, longest {seconds.max():.0f}")
+    return "\n".join(lines)
+
+
+def _read_judged(path: Path) -> list[dict[str, Any]]:
+    """Rows of a file of cases, with what became of them."""
+    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    return [row | judge(row["sealed"], row) for row in rows]
+
+
+def tabulate(sets: dict[str, list[dict[str, Any]]]) -> str:
+    """A line of a table for each set of cases: how many of every group, and what became of them."""
+    lines = [
+        "| set | cases | singles told | wrong | weak told | wrong | pairs told | one of them | wrong | unknown refused | clean, alarms | s |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name, rows in sets.items():
+        outcomes = {group: [row["outcome"] for row in rows if row["case"]["group"] == group] for group in GROUPS}
+
+        def count(group: str, *which: str, outcomes: dict[str, list[str]] = outcomes) -> str:
+            return str(sum(outcome in which for outcome in outcomes[group]))
+
+        def share(group: str, *which: str, outcomes: dict[str, list[str]] = outcomes) -> str:
+            return f"{count(group, *which, outcomes=outcomes)} of {len(outcomes[group])}"
+
+        cells = [
+            name.removeprefix("concealed_").replace("_", " "),
+            str(len(rows)),
+            share("single", "named", "among"),
+            count("single", "wrong", "crowd"),
+            share("weak", "named", "among"),
+            count("weak", "wrong", "crowd"),
+            share("pair", "named", "among"),
+            count("pair", "part"),
+            count("pair", "wrong", "crowd"),
+            share("unknown", "refused", "missed"),
+            f"{len(outcomes['clean'])}, {count('clean', 'false alarm')}",
+            f"{np.median([row['seconds'] for row in rows]):.0f}",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 

@@ -55,7 +55,7 @@ __all__ = ["Scene"]
 
 FINE = 4
 """Most time steps in a row at which effects are evaluated."""
-MOVED = 0.15
+MOVED = 0.03
 """How far θ's z and parameters of effects on the model may move before it is found anew where the steps lead."""
 TOGETHER = 8
 """Points beside a motion in a program."""

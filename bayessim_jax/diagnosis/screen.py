@@ -35,6 +35,8 @@ ITERATIONS, AGAIN = 6, 3
 """Steps of the solver with the noise of before, and then with its own."""
 INERTIAS, BAD = ("kg", "kg m²"), 1.5
 """Units of parameters for which θ gives way first, where an effect begins at so many times the cost without it."""
+FALLING = 6
+"""Steps more of them before some are left behind: from far away they first make up for what θ had taken of it."""
 RACES = ((3, False, 4), (4, True, 2), (6, True, 2))
 """Steps of the solver from the points that a candidate is begun from, whether parameters that are scanned move, and how
 many points go on; one race after the other."""
@@ -264,6 +266,7 @@ class Screen:
         bad = BAD * known.cost if weighs else np.inf
         likelihood = -np.inf
         for steps, scanned, kept in races:
+            steps += FALLING if weighs and len(ends) > kept else 0  # noqa: PLW2901
             tried = [self.fit(candidate, p, delta, known.sigma, steps, scanned, bad) for p, delta in ends]
             best = sorted((end for end in tried if end[2] is not None), key=lambda end: float(end[2].cost))
             if not best:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import permutations
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -250,8 +251,9 @@ def decide(
 
     The confusion set is what explains the misfit and predicts held-out windows as well as the best candidate; of these
     the ones with the fewest effects, of effects that contain one another the special case, and none that does so only
-    with numbers that are a coincidence where others need none: a ripple with one cycle per turn is a tilt. Where what
-    the simulator's time step does explains the misfit alone, nothing is missing.
+    with numbers that are a coincidence where others need none: a ripple with one cycle per turn is a tilt. What scores
+    better by more than that is none. Where what the simulator's time step does explains the misfit alone, nothing is
+    missing.
     """
     result = Diagnosis("unexplained", bench, none, entries, screened=screened)
     if not entries or entries[0].score - none.score < thresholds.least:
@@ -268,10 +270,15 @@ def decide(
     fewest = min(map(len, best))
     least = [entry for names, entry in best.items() if len(names) == fewest]
     sets = [entry for entry in least if not any(has_special_case(entry, other) for other in least)]
-    least_share = max(entry.log_share for entry in sets) - thresholds.coincidence
-    sets = [entry for entry in sets if entry.log_share >= least_share]
+    temper = thresholds.least / _resolution(entries[0], none, thresholds)
+
+    def is_coincidence(entry: Entry, other: Entry) -> bool:
+        better = max(temper * (entry.score - other.score), 0.0)
+        return other.log_share - entry.log_share > thresholds.coincidence + better
+
+    sets = [entry for entry in sets if not any(is_coincidence(entry, other) for other in sets)]
     result.confusion = sorted(sets, key=lambda e: (len(bench.columns(e.candidate)), -e.score))
-    result.probabilities = _weigh(result, group, thresholds.least / _resolution(entries[0], none, thresholds))
+    result.probabilities = _weigh(result, group, temper)
     result.verdict = "explained" if len(sets) == 1 else "ambiguous"
     return result
 
@@ -449,11 +456,17 @@ def are_siblings(one: str, other: str) -> bool:
 
 
 def has_special_case(entry: Entry, other: Entry) -> bool:
-    """Whether another candidate is this one with one effect replaced by a special case of it."""
-    mine, theirs = (
-        {e.seats.get(name, name) for name in set(e.names) - set(o.names)} for e, o in ((entry, other), (other, entry))
+    """Whether another candidate is this one with effects replaced by special cases of them, each at its place."""
+    return len(entry.names) == len(other.names) and set(entry.names) != set(other.names) and _is_left(other, entry)
+
+
+def _is_left(part: Entry, whole: Entry) -> bool:
+    """Whether a set is what is left of another one without some effects and with special cases of some."""
+    less, more = (
+        [e.seats.get(name, name) for name in sorted(set(e.names) - set(o.names))]
+        for e, o in ((part, whole), (whole, part))
     )
-    return len(mine) == len(theirs) == 1 and contains(mine.pop(), theirs.pop())
+    return any(all(map(contains, chosen, less)) for chosen in permutations(more, len(less)))
 
 
 def _weigh(result: Diagnosis, group: Int[np.ndarray, " windows"], temper: float) -> list[float]:
@@ -477,12 +490,7 @@ def _weigh(result: Diagnosis, group: Int[np.ndarray, " windows"], temper: float)
     own = np.array([weights[index[id(entry)]] for entry in result.confusion])
     for entry, weight in zip(result.entries, weights, strict=True):
         if not any(entry is chosen for chosen in result.confusion):
-            stands = np.array([_stands_for(chosen, entry) for chosen in result.confusion], float)
+            stands = np.array([_is_left(chosen, entry) for chosen in result.confusion], float)
             own = own + (weight * stands / stands.sum() if stands.any() else 0.0)
     explained = [1.0 - share_left(entry.misfit, result.baseline.misfit) for entry in result.confusion]
     return [float((1.0 - MIMICRY) * w * part) for w, part in zip(own, explained, strict=True)]
-
-
-def _stands_for(chosen: Entry, other: Entry) -> bool:
-    """Whether a set is a part of another or all of it, or the other with an effect replaced by its special case."""
-    return set(chosen.names) <= set(other.names) or has_special_case(other, chosen)

@@ -119,9 +119,18 @@ def test_candidates_that_predict_alike_are_a_confusion_set():
     assert min(found.probabilities) > 0.01
 
 
-@pytest.mark.parametrize(("share", "wanted"), [(-12.0, "ambiguous"), (-20.0, "explained")])
-def test_what_does_as_well_by_a_coincidence_of_its_numbers_is_no_rival(share, wanted):
-    plain, contrived = entry(["a@x"], 100.0, 0.002), entry(["b@x"], 100.0, 0.002, seed=1)
+@pytest.mark.parametrize(
+    ("share", "better", "wanted"),
+    [
+        (-12.0, 0.0, "ambiguous"),
+        (-20.0, 0.0, "explained"),
+        (-20.0, 0.3, "ambiguous"),  # the windows say more than the numbers are a coincidence
+        (-30.0, 0.3, "explained"),
+    ],
+)
+def test_what_does_as_well_by_a_coincidence_of_its_numbers_is_no_rival(share, better, wanted):
+    plain, contrived = entry(["a@x"], 100.0, 0.002, p=0.4), entry(["b@x"], 100.0, 0.002, p=0.4, seed=1)
+    contrived.scores += plain.scores.mean() - contrived.scores.mean() + better
     plain.log_share, contrived.log_share = -10.0, share
     found = verdict(plain, contrived)
     assert found.verdict == wanted
@@ -257,6 +266,23 @@ def test_a_special_case_stands_for_what_contains_it():
     assert verdict(rotor, gap).best.names == rotor.names
     assert are_kin("coulomb_friction@joint/a", "stribeck_friction@joint/a")
     assert not are_kin("coulomb_friction@joint/a", "coulomb_friction@joint/b")
+
+
+def test_a_set_stands_for_all_that_it_is_left_of():
+    def friction(at_a, at_b, *more, seed=0):
+        return entry([f"{at_a}@joint/a", f"{at_b}@joint/b", *more], 100.0, 0.0, seed=seed)
+
+    plain = friction("coulomb_friction", "coulomb_friction")
+    both, more = (
+        friction("stribeck_friction", "asymmetric_friction", seed=1),
+        friction("coulomb_friction", "lugre_friction", "armature@joint/a", seed=2),
+    )
+    crossed = entry(["coulomb_friction@joint/a", "stribeck_friction@joint/a"], 100.0, 0.0, seed=3)
+    found = verdict(plain, both, more)
+    assert [e.names for e in found.confusion] == [plain.names]
+    assert found.probabilities[0] == pytest.approx(0.95, abs=0.01)
+    # two laws of one joint are no law of the other's
+    assert len(verdict(plain, crossed).confusion) == 2
 
 
 @pytest.mark.parametrize(
