@@ -59,6 +59,7 @@ FAMILIES: dict[str, tuple[str, ...]] = {
 RIGS = ["pendulum", "slide", "swing", "cart", "double"]
 SEED = 77
 TRIED = (0.005, 0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15)
+PRODUCTS = (0.0001, 0.0003, 0.001, 0.003, 0.01, 0.03)
 
 
 def relatives(effect: str) -> set[str]:
@@ -67,11 +68,18 @@ def relatives(effect: str) -> set[str]:
 
 
 def _short(diagnosis: CaseDiagnosis) -> dict[str, Any]:
-    """Verdict, best candidate, and the share of the misfit that it leaves."""
+    """Verdict, answers, the best candidate, and what it leaves of the misfit and of the error ahead."""
     result = diagnosis.result
-    left = diagnosis.shares_left[0] if result.entries else 1.0
-    names = result.entries[0].names if result.entries else []
-    return {"verdict": result.verdict, "names": names, "left": left, "p_value": result.best.misfit.p_value}
+    best = result.entries[0] if result.entries else None
+    return {
+        "verdict": result.verdict,
+        "confusion_set": [entry.names for entry in result.confusion],
+        "names": best.names if best else [],
+        "left": diagnosis.shares_left[0] if best else 1.0,
+        "ahead": best.ahead if best else float("nan"),
+        "p_value": result.best.misfit.p_value,
+        "taken_back": result.taken_back is not None,
+    }
 
 
 def leave_families_out(options: Namespace) -> None:
@@ -98,14 +106,28 @@ def leave_families_out(options: Namespace) -> None:
 
 
 def summarize(rows: Sequence[dict[str, Any]]) -> str:
-    """What every threshold does: right names kept, wrong names let through."""
+    """What becomes of the answers, and what every threshold would do: right names kept, wrong ones let through."""
     seen = [row for row in rows if row["without"]["verdict"] != "no_mismatch"]
     named = [row for row in seen if row["case"]["effects"] == [n.partition("@")[0] for n in row["whole"]["names"]]]
-    right, wrong = (np.array([row[which]["left"] for row in of]) for which, of in (("whole", named), ("without", seen)))
-    lines = [f"{len(right)} right names, {len(wrong)} machines without the family"]
-    lines += ["left   right kept   wrong let through"]
-    lines += [f"{t:<6} {np.mean(right <= t):>10.1%} {np.mean(wrong <= t):>19.1%}" for t in TRIED if len(right)]
+    lines = []
+    for which, said in (("whole", "the whole library"), ("without", "without the family")):
+        verdicts = Counter(row[which]["verdict"] for row in rows)
+        back = sum(row[which]["taken_back"] for row in rows)
+        parts = ", ".join(f"{verdict} {verdicts[verdict]}" for verdict in sorted(verdicts))
+        lines.append(f"{said}: {parts}; taken back by recordings left out {back}")
+    lines.append(f"{len(named)} right names come first, {len(seen)} machines show a misfit without the family")
+    for key, what, tried in (("left", "left", TRIED), ("both", "left × ahead", PRODUCTS)):
+        right, wrong = (
+            np.array([_leaves(row[side], key) for row in of]) for side, of in (("whole", named), ("without", seen))
+        )
+        lines.append(f"{what:<13} right kept   wrong let through")
+        lines += [f"{t:<13g} {np.mean(right <= t):>10.1%} {np.mean(wrong <= t):>19.1%}" for t in tried if len(right)]
     return "\n".join(lines)
+
+
+def _leaves(found: dict[str, Any], key: str) -> float:
+    """The share of the misfit, or times that of the error ahead; what was not looked at ahead leaves all of it."""
+    return found["left"] * (1.0 if key == "left" or not np.isfinite(found["ahead"]) else found["ahead"])
 
 
 def hold_against_held_out(records: Sequence[Path]) -> str:
