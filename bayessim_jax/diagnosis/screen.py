@@ -7,7 +7,7 @@ hundredths of a second, so that pairs are tried as well. What comes out on top i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, product
@@ -261,8 +261,7 @@ class Screen:
         races: Sequence[tuple[int, bool, int]],
     ) -> Begun | None:
         """Fit a candidate from several points, of which the best go on."""
-        added = [k for k in candidate.effects if k not in known.candidate.effects]
-        weighs = any(p.unit in INERTIAS for k in added for p in self.scene.parameters[k])
+        weighs = self._weighs(k for k in candidate.effects if k not in known.candidate.effects)
         bad = BAD * known.cost if weighs else np.inf
         likelihood = -np.inf
         for steps, scanned, kept in races:
@@ -273,6 +272,10 @@ class Screen:
                 return None
             ends, likelihood = [end[:2] for end in best[:kept]], self._profile(best[0][3], known.sigma)
         return Begun(candidate, ends, likelihood)
+
+    def _weighs(self, effects: Iterable[int]) -> bool:
+        """Whether some effects take from the masses that were fitted without them."""
+        return any(p.unit in INERTIAS for k in effects for p in self.scene.parameters[k])
 
     def _profile(self, r: Array, sigma: Array) -> float:
         """Log likelihood at the noise that residuals have, up to a constant."""
@@ -370,15 +373,16 @@ class Screen:
     ) -> list[tuple[Any, Array]]:
         """Points (p, δ) of a candidate beside a fit of a part of it.
 
-        What is added begins nearly neutral, as usual, or as it was fitted `alone`; where parameters are scanned, also
-        at the best points of the scan beside what is known.
+        What is added begins nearly neutral, as usual, or as it was fitted `alone`; where parameters are scanned, and
+        with what weighs on a body and has several, also at the best points of a scan beside what is known.
         """
         added = Candidate(tuple(k for k in candidate.effects if k not in known.candidate.effects))
         begin, weak = self._begin(added), self._begin(added, NEAR)
         points = [weak, begin] if np.abs(begin - weak).max(initial=0.0) > 0.0 else [begin]
         starts = [*points, *([alone] if alone is not None else [])]
         ends = [(self._put(candidate, known, start), known.delta) for start in starts]
-        if any(p.scan for k in added.effects for p in self.scene.parameters[k]):
+        onto_bodies = [k for k in added.effects if self.pairs[k][0].port == "model" and len(self.scene.parameters[k]) > 1]
+        if any(p.scan for k in added.effects for p in self.scene.parameters[k]) or self._weighs(onto_bodies):
             scan = [(self._put(candidate, known, start), known.delta) for start in self.starts(added)]
             self.scene.begin_around(known.candidate, known.p)
             found = self._race(candidate, known, scan, SCAN)

@@ -28,7 +28,7 @@ class LinkOffset(ModelEffect):
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """The offset x."""
         length = scales.length
-        return (EffectParameter("offset", "m", -0.5 * length, 0.5 * length, 0.0, 0.03 * length),)
+        return (EffectParameter("offset", "m", -length, length, 0.0, 0.03 * length),)
 
     def targets(self, model: mujoco.MjModel, place: str) -> tuple[tuple[str, tuple[int, ...]], ...]:
         """The components of the centre of mass that change."""

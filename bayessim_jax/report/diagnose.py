@@ -17,7 +17,7 @@ from bayessim_jax.report.misfit import candidates_plot, misfit_map
 from bayessim_jax.report.replay import replay_animation
 from bayessim_jax.report.residuals import residual_plot
 from bayessim_jax.report.style import BLUE, ORANGE, PURPLE
-from bayessim_jax.report.timelines import window_traces
+from bayessim_jax.report.timelines import channel_labels, window_traces
 from bayessim_jax.report.viewer import SCRIPT_HASH, script
 from bayessim_jax.report.words import number, plus_minus
 
@@ -259,7 +259,7 @@ def _residuals(diagnosis: CaseDiagnosis) -> tuple[str, str, str]:
     shown = ["baseline", *(["augmented"] if diagnosis.result.names_something else [])]
     errors = {name: np.where(measured, y - diagnosis.predictions[name][held], np.nan) for name in shown}
     noise = diagnosis.result.best.misfit.noise
-    svg = residual_plot(diagnosis.windows.time[held], y, errors, diagnosis.model.channels, noise)
+    svg = residual_plot(diagnosis.windows.time[held], y, errors, channel_labels(diagnosis.model), noise)
     caption = (
         "Left: root mean square error against the time since a prediction started; dotted: the noise. Right: errors of "
         "the last of them against the measured value, with their median."

@@ -13,7 +13,7 @@ from bayessim_jax.report.pairs import pair_plot
 from bayessim_jax.report.replay import replay_animation
 from bayessim_jax.report.residuals import residual_plot
 from bayessim_jax.report.style import BLUE, ORANGE
-from bayessim_jax.report.timelines import window_traces
+from bayessim_jax.report.timelines import channel_labels, window_traces
 from bayessim_jax.report.viewer import SCRIPT_HASH, script
 from bayessim_jax.report.words import number, plus_minus
 
@@ -178,7 +178,7 @@ def _residuals(result: CaseInference) -> tuple[str, str, str]:
     y = np.asarray(shots.y)
     errors = {name: np.where(measured, y - p, np.nan) for name, p in result.predictions.items()}
     time = result.held_out.time
-    svg = residual_plot(time, y, errors, result.model.channels, np.asarray(result.posterior.fit.sigma))
+    svg = residual_plot(time, y, errors, channel_labels(result.model), np.asarray(result.posterior.fit.sigma))
     caption = (
         "Left: root mean square error against the time since a prediction started; the dotted line is the estimated "
         "noise. Right: errors after the fit against the measured value, with their median."

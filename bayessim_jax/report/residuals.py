@@ -24,11 +24,11 @@ def residual_plot(
     time: Float[np.ndarray, "windows rows"],
     y: Float[np.ndarray, "windows rows obs"],
     errors: Mapping[str, Float[np.ndarray, "windows rows obs"]],
-    channels: Sequence[str],
+    labels: Sequence[str],
     sigma: Float[np.ndarray, " obs"],
 ) -> str:
-    """For each channel its error against lead time, for every predictor, and the last one's against the state."""
-    shown = list(range(len(channels)))[:MOST]
+    """For each channel, by its label, its error against lead time, for every predictor, and the last one's against the state."""
+    shown = list(range(len(labels)))[:MOST]
     colours = [ORANGE, BLUE]
 
     def draw(figure: Figure) -> None:
@@ -40,7 +40,7 @@ def residual_plot(
                 lead = np.nanmax(time, axis=0)
                 left.plot(lead[: len(rms)], rms, color=colour, linewidth=1.4, label=name)
             left.axhline(sigma[k], color=GREY, linestyle=":", linewidth=1.0)
-            left.set_ylabel(channels[k])
+            left.set_ylabel(labels[k])
             left.set_ylim(bottom=0)
             error = list(errors.values())[-1][..., k].ravel()
             state = y[..., k].ravel()

@@ -10,9 +10,10 @@ from jaxtyping import Float, Int
 
 from bayessim_jax.recordings.shots import CaseModel
 from bayessim_jax.recordings.windows import Windows
+from bayessim_jax.report.style import quantity
 from bayessim_jax.report.viewer import compact, traces
 
-__all__ = ["window_traces"]
+__all__ = ["channel_labels", "window_traces"]
 
 MOST_ROWS = 2400
 """Rows of a recording that are drawn; longer ones are thinned out."""
@@ -43,6 +44,10 @@ def window_traces(
         data: dict[str, Any] = {key: compact(joined[key][keep].T) for key in values}
         data |= {"time": compact(joined["time"][keep], 7), "start": joined["start"][keep].astype(int).tolist()}
         recordings.append((model.recordings[index].name, data))
+    return traces(recordings, channel_labels(model), series, caption)
+
+
+def channel_labels(model: CaseModel) -> list[str]:
+    """What is measured, with its units."""
     units = model.case.layout.units
-    labels = [f"{c} [{units[c]}]" if units.get(c) else c for c in model.channels]
-    return traces(recordings, labels, series, caption)
+    return [quantity(channel, units.get(channel, "")) for channel in model.channels]
