@@ -265,7 +265,7 @@ class Screen:
         bad = BAD * known.cost if weighs else np.inf
         likelihood = -np.inf
         for steps, scanned, kept in races:
-            steps += FALLING if weighs and len(ends) > kept else 0  # noqa: PLW2901
+            steps += FALLING if weighs and len(ends) > kept else 0
             tried = [self.fit(candidate, p, delta, known.sigma, steps, scanned, bad) for p, delta in ends]
             best = sorted((end for end in tried if end[2] is not None), key=lambda end: float(end[2].cost))
             if not best:
@@ -381,8 +381,9 @@ class Screen:
         points = [weak, begin] if np.abs(begin - weak).max(initial=0.0) > 0.0 else [begin]
         starts = [*points, *([alone] if alone is not None else [])]
         ends = [(self._put(candidate, known, start), known.delta) for start in starts]
-        onto_bodies = [k for k in added.effects if self.pairs[k][0].port == "model" and len(self.scene.parameters[k]) > 1]
-        if any(p.scan for k in added.effects for p in self.scene.parameters[k]) or self._weighs(onto_bodies):
+        scanned = any(p.scan for k in added.effects for p in self.scene.parameters[k])
+        loads = [k for k in added.effects if self.pairs[k][0].port == "model" and self._weighs((k,))]
+        if scanned or any(len(self.scene.parameters[k]) > 1 for k in loads):
             scan = [(self._put(candidate, known, start), known.delta) for start in self.starts(added)]
             self.scene.begin_around(known.candidate, known.p)
             found = self._race(candidate, known, scan, SCAN)

@@ -27,7 +27,7 @@ def residual_plot(
     labels: Sequence[str],
     sigma: Float[np.ndarray, " obs"],
 ) -> str:
-    """For each channel, by its label, its error against lead time, for every predictor, and the last one's against the state."""
+    """For every channel, by its label, the errors of all predictors over lead time, and of the last over the state."""
     shown = list(range(len(labels)))[:MOST]
     colours = [ORANGE, BLUE]
 
