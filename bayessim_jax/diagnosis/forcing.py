@@ -53,6 +53,8 @@ class Partners:
     acceleration: Float[Numbers, "m windows steps"]
     """Of the joint."""
     drive: Float[Numbers, "m windows steps"]
+    before: Float[Numbers, "m windows before"] | None = None
+    """What actuators exerted before the windows, where an effect remembers that."""
 
 
 @struct.dataclass
@@ -105,7 +107,7 @@ def force_of(
         values = _named(names, x)
         return effect.force(values, effect.begin(values, moment(*now)), moment(*now))[0]
 
-    def force(x: Array, joint: Joint = joint) -> Array:
+    def force(x: Array, joint: Joint = joint, earlier: Any = earlier) -> Array:
         values = _named(names, x)
 
         def window(time: Array, joint: Joint, other: Joint | None, earlier: Any) -> Array:
@@ -130,11 +132,13 @@ def force_of(
 
     if partners is not None:
 
-        def among(x: Array, acceleration: Array, drive: Array) -> Array:
-            return force(x, dataclasses.replace(joint, acceleration=acceleration, drive=drive))
+        def among(x: Array, acceleration: Array, drive: Array, before: Array | None) -> Array:
+            there = dataclasses.replace(joint, acceleration=acceleration, drive=drive)
+            return force(x, there, earlier if earlier is None or before is None else (*earlier[:2], before))
 
-        here = numbers, joint.acceleration, joint.drive
-        moves = partners.own, partners.acceleration, partners.drive
+        drives = None if earlier is None or partners.before is None else earlier[2]
+        here = numbers, joint.acceleration, joint.drive, drives
+        moves = partners.own, partners.acceleration, partners.drive, None if drives is None else partners.before
         return jax.vmap(lambda *move: jax.jvp(among, here, move), out_axes=(None, -1))(*moves)
     now = jax.tree.map(lambda a: a[0, 0], (time, joint, other))
     remembers = jax.tree.leaves(effect.begin(_named(names, numbers), moment(*now)))

@@ -197,7 +197,7 @@ class Scene(CandidatesOf):
         exerting = [(k, place) for k, place in self.offsets(candidate) if self.pairs[k][0].port == "force"]
         # what holds a joint withstands what the others exert on it
         for k, place in sorted(exerting, key=lambda item: self.pairs[item[0]][0].holds):
-            self._exert(k, p, place, around, pushes)
+            self._exert(candidate, k, p, place, around, pushes)
         raw = np.asarray(self._windowed(p, self.motion).seen) if readings else np.zeros(0)
         forcing = Forcing(
             pushes.force, pushes.along, _distort(np.asarray(around.windowed.seen), raw, readings, nv, size)
@@ -401,11 +401,7 @@ class Scene(CandidatesOf):
 
     def _drive(self, candidate: Candidate, p: Float[np.ndarray, " k"], around: _Around, pushes: _Pushes) -> None:
         """What a candidate's effects on commands change in forces: those of the same actuators one after the other."""
-        groups: dict[tuple[int, ...], list[tuple[int, slice]]] = {}
-        for k, place in self.offsets(candidate):
-            if self.pairs[k][0].port == "act":
-                groups.setdefault(tuple(self.sites[k].actuators), []).append((k, place))
-        for actuators, effects in groups.items():
+        for actuators, effects in self._acting(candidate).items():
             gains = self._gains(actuators, around)
             if len(effects) == 1:
                 (k, place) = effects[0]
@@ -420,6 +416,14 @@ class Scene(CandidatesOf):
             for i, actuator in enumerate(actuators):
                 dof = self._dof(int(self.model.actuator_trnid[actuator, 0]))
                 pushes.add(dof, f[..., i], along[..., i, :], columns, drives=True)
+
+    def _acting(self, candidate: Candidate) -> dict[tuple[int, ...], list[tuple[int, slice]]]:
+        """A candidate's effects on commands in their order, and their places in p, by the actuators."""
+        groups: dict[tuple[int, ...], list[tuple[int, slice]]] = {}
+        for k, place in self.offsets(candidate):
+            if self.pairs[k][0].port == "act":
+                groups.setdefault(tuple(self.sites[k].actuators), []).append((k, place))
+        return groups
 
     def _pass_all(
         self, effects: Sequence[tuple[int, slice]], p: Float[np.ndarray, " k"], around: _Around, size: int
@@ -448,8 +452,16 @@ class Scene(CandidatesOf):
         along = gains * passed.along[:, :, before:].reshape(size, *rows).mean(3)
         return f, np.moveaxis(along, 0, -1)
 
-    def _exert(self, k: int, p: Float[np.ndarray, " k"], place: slice, around: _Around, pushes: _Pushes) -> None:
-        """Add what an effect exerts on its joint, under what others exert there."""
+    def _exert(
+        self,
+        candidate: Candidate,
+        k: int,
+        p: Float[np.ndarray, " k"],
+        place: slice,
+        around: _Around,
+        pushes: _Pushes,
+    ) -> None:
+        """Add what one of a candidate's effects exerts on its joint, under what others exert there."""
         effect, site, dof = self.pairs[k][0], self.sites[k], self._dof(self.sites[k].joint)
         joint = self._joint(site.joint, around, site.actuators)
         other = self._joint(site.other, around, ()) if site.other >= 0 else None
@@ -460,9 +472,45 @@ class Scene(CandidatesOf):
             size = pushes.along.shape[-1]
             joint, partners = pushes.beside(dof, joint, self._ways(place, size) * numbers[1], self.fine)
             columns = slice(None)
+            if earlier is not None and dof in pushes.drives:
+                change, along = self._driven_before(candidate, p, site.joint, around, size)
+                earlier = (*earlier[:2], np.asarray(earlier[2]) + change)
+                partners = dataclasses.replace(partners, before=along)
         seen = (self.h, self.fine, *numbers, self.times, joint, other, earlier, self.system.dt, partners)
         f, along = force_of(effect, self.names[k], site.detail, *seen)
         pushes.add(dof, f, along, columns)
+
+    def _driven_before(
+        self, candidate: Candidate, p: Float[np.ndarray, " k"], joint: int, around: _Around, size: int
+    ) -> tuple[Float[np.ndarray, "windows before"], Float[np.ndarray, "e windows before"]]:
+        """What effects on commands changed in what actuators exerted on a joint before the windows; its derivatives.
+
+        A row is a step of what they remember, and the first command of all had been held for long.
+        """
+        assert self.motion.earlier is not None
+        position, velocity = (
+            np.asarray(x)[..., i]
+            for x, i in zip(self.motion.earlier, (int(self.model.jnt_qposadr[joint]), self._dof(joint)), strict=True)
+        )
+        past, dt = np.asarray(self.motion.past), self.system.dt
+        times = np.asarray(self.motion.start)[:, None] + dt * np.arange(-past.shape[1], 0)
+        change, slopes = np.zeros(past.shape[:2]), np.zeros((size, *past.shape[:2]))
+        for actuators, effects in self._acting(candidate).items():
+            own = [i for i, a in enumerate(actuators) if int(self.model.actuator_trnid[a, 0]) == joint]
+            if not own:
+                continue
+            gains, raw = self._gains(actuators, around), self._limited(past, actuators)
+            passed = Passed(raw, raw[:, :0], np.zeros((size, *raw.shape)), np.zeros((size, *raw[:, :0].shape)))
+            nothing = np.zeros_like(position)
+            inertia = np.asarray(self._joint(joint, around, ()).inertia)[:, :1] + nothing
+            seen = Joint(*map(_device, (position, velocity, nothing, inertia, nothing)))
+            for k, place in effects:
+                numbers, along = self._numbers_at(k, p[place]), self._ways(place, size)
+                at_work = (numbers[0], along * numbers[1], times, seen, passed, gains)
+                passed = pass_on(self.pairs[k][0], self.names[k], dt, 0, 0.0, *at_work)
+            change += (gains * (np.asarray(passed.commands) - raw))[..., own].sum(-1)
+            slopes += (gains * np.asarray(passed.along))[..., own].sum(-1)
+        return change, slopes
 
     def _ways(self, place: slice, size: int) -> Float[np.ndarray, "e own"]:
         """How an effect's own numbers move with a candidate's."""

@@ -19,6 +19,7 @@ from bayessim_jax.effects.contract import Moment, Number, Numbers
 from bayessim_jax.effects.history import split_history
 from bayessim_jax.effects.places import Site
 from bayessim_jax.effects.rig import AugmentedState, Rig, as_arrays
+from bayessim_jax.effects.wiring import Wired
 
 __all__ = [
     "NONE",
@@ -30,6 +31,7 @@ __all__ = [
     "pass_commands",
     "pass_early",
     "pass_one",
+    "pass_past",
     "warm_up",
 ]
 
@@ -105,6 +107,44 @@ def warm_up(
         state = afresh.with_memories(long_ago)
     begun = replace(state, time=state.time - len(past) * rig.dt)
     return state.with_memories(_last(pass_early(rig, theta, numbers, begun, past, blind)[1]))
+
+
+def pass_past(
+    rig: Rig,
+    theta: Float[Array, " d"],
+    numbers: Numbers,
+    state: AugmentedState,
+    past: Actions,
+    qpos: Float[Array, "periods nq"],
+    qvel: Float[Array, "periods nv"],
+) -> Actions:
+    """What arrived of past commands in every control period, which is one step of effects that remember.
+
+    The first of them had been held for long; positions and velocities are those at the beginning of each period.
+    """
+    columns, first = _limit(rig, numbers, past), state.time - len(past) * rig.dt
+    for _, w in rig.at("act"):
+        values, picked = w.values(theta), _pick(columns, w.site)
+        moment = rig.see_actuator(numbers, state, w.site)._replace(time=first, h=rig.dt)
+        held = jax.tree.map(lambda column: column[0], picked)
+        memory = as_arrays(w.effect.begin(values, held, moment), first)
+        if not w.effect.looks:
+            new = w.effect.ahead(values, memory, picked, moment)[0]
+        else:
+            q, v = rig.address(w.site.joint)
+            # without a memory the length of a step is that of the simulation
+            h = rig.dt if jax.tree.leaves(memory) else rig.h
+
+            def once(memory: Any, now: Any, w: Wired = w, values: Any = values, moment: Moment = moment) -> Any:
+                command, time, position, velocity = now
+                seen = moment._replace(time=time, h=h, position=position, velocity=velocity)  # noqa: B023
+                new, memory = w.effect.command(values, memory, command, seen)
+                return memory, new
+
+            times = first + rig.dt * jnp.arange(len(past))
+            new = jax.lax.scan(once, memory, (picked, times, qpos[:, q], qvel[:, v]))[1]
+        columns = _put(columns, w.site, new)
+    return jnp.stack(columns, -1)
 
 
 def early_effects(rig: Rig) -> frozenset[int]:

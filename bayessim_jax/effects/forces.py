@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from bayessim_jax.contracts import Scalar
+from bayessim_jax.effects.commands import pass_past
 from bayessim_jax.effects.contract import Number, Numbers, Past
 from bayessim_jax.effects.drive import CAUTION, actuators_of, drive_of
 from bayessim_jax.effects.rig import AugmentedState, Grip, Rig, as_arrays
@@ -89,13 +90,15 @@ def recall_motion(
     ctrl: Float[Array, "periods act"],
     moves: Float[Array, " m"] | None = None,
 ) -> AugmentedState:
-    """The memories of effects that remember how their joint has moved, and under which commands.
+    """The memories of effects that remember how their joint has moved, and under what had become of which commands.
 
     `moves` are how far the effects that do not settle, one after the other, were from the best guess before that.
     """
     recalled, physics = {}, state.base.physics
     unsettled = [k for k, w in rig.at("force") if not w.effect.settles]
     recorded = recorded_steps(state.time, len(qpos), rig.dt)
+    if rig.at("act") and any(w.effect.recalls for _, w in rig.at("force")):
+        ctrl = pass_past(rig, theta, numbers, state, ctrl, qpos, qvel)
     for k, w in rig.at("force"):
         if w.effect.recalls:
             q, v = rig.address(w.site.joint)

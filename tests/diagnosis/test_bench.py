@@ -146,6 +146,29 @@ def test_effects_beside_others_have_the_slopes_of_differences(problem, effects):
         np.testing.assert_allclose(asked, (ahead - behind) / 2e-5, atol=1e-3 * np.abs(asked).max())
 
 
+@pytest.mark.parametrize("effects", [(0, 2), (1, 2), (0, 1, 2), (1, 3)])
+def test_what_arrived_of_commands_before_a_window_has_the_slopes_of_differences(problem, effects):
+    """A rotor on a spring and a motor in its gap remember what moved them, which another effect has changed."""
+    act, joint = "actuator/motor", "joint/hinge"
+    named = (("actuator_lag", act), ("back_emf", act), ("joint_flexibility", joint), ("backlash", act))
+    steps = np.arange(-problem.motion.past.shape[1], 0)[:, None] * problem.system.dt
+    first = [np.asarray(x)[:, :1] for x in (problem.motion.qpos, problem.motion.qvel)]
+    earlier = first[0] + first[1] * steps, first[1] + 0.0 * steps
+    motion = dataclasses.replace(problem.motion, earlier=tuple(map(jnp.asarray, earlier)))
+    scene = dataclasses.replace(problem, motion=motion).screen([(EFFECTS[name], place) for name, place in named]).scene
+    candidate, p = Candidate(effects), np.zeros(scene.d + scene.slots)
+    count = scene.count(candidate)
+    p[scene.d : scene.d + count] = 0.3 * np.random.default_rng(0).normal(size=count)
+    sigma, still = jnp.full(len(problem.system.channels), 0.1), jnp.zeros((len(scene.motion.start), 2))
+    here, slopes = scene.expand(candidate, p, still, sigma)
+    for k in range(scene.d, scene.d + count):
+        ahead, behind = (
+            scene.expand(candidate, p + e * (np.arange(p.size) == k), still, sigma)[0] for e in (1e-5, -1e-5)
+        )
+        asked = -np.asarray(slopes)[:, k].reshape(here.shape)
+        np.testing.assert_allclose(asked, (ahead - behind) / 2e-5, atol=1e-3 * np.abs(asked).max())
+
+
 def test_a_pair_on_one_motor_is_found_in_the_order_of_the_machine(problem, tmp_path):
     """A bias that is added to a limited command is not one that is limited with it."""
     names = ("actuator_bias", "actuator_saturation")

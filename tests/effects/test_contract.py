@@ -331,6 +331,27 @@ def test_a_bent_joint_remembers_how_it_has_moved(yields, move, tolerance):
     assert float(augmented.begin(theta, *where, time=0.6).memories[0]) != pytest.approx(bent, rel=0.3)
 
 
+@pytest.mark.parametrize(
+    ("effect", "values"), [("actuator_gain", [2.0]), ("actuator_lag", [0.04]), ("back_emf", [0.1, 0.4])]
+)
+def test_a_rotor_remembers_what_arrived_of_commands(effect, values):
+    """A soft drive, bent by what its motor exerts, which is not what was commanded."""
+    base = system(*MODELS["pendulum"])
+    pairs = [("joint_flexibility", "joint/hinge"), (effect, "actuator/m")]
+    augmented = with_effects(base, [(EFFECTS[n], p) for n, p in pairs], Scales())
+    theta, actions = jnp.array([0.5, 8.0, 0.05, 0.005, *values]), jnp.asarray(chirp(80, force=0.5), float)
+    begun = augmented.begin(theta, jnp.array([0.3]), jnp.zeros(1), actions[0])
+    states = augmented.replay(theta, begun, actions)
+    states = jax.tree.map(lambda first, after: jnp.concatenate([first[None], after]), begun, states)
+    for k in (40, 50, 60, 70):
+        middle = jax.tree.map(lambda x: x[k], states)  # noqa: B023
+        motion = tuple(jax.vmap(read)(states)[:k] for read in (augmented.positions, augmented.velocities))
+        where = (augmented.positions(middle), augmented.velocities(middle), actions[k])
+        recalled = augmented.begin(theta, *where, time=0.01 * k, motion=motion, past=actions[:k])
+        bend, wanted = (float(s.memories[0][0] - augmented.positions(middle)[0]) for s in (recalled, middle))
+        assert bend == pytest.approx(wanted, abs=0.01)
+
+
 def test_what_a_system_lacks_is_told():
     base = system(*MODELS["pendulum"])
     with pytest.raises(ValueError, match="no hinge or slide 'knee'"):
