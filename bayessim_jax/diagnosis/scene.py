@@ -380,6 +380,8 @@ class Scene(CandidatesOf):
         if not sensors:
             return self.motion, []
         qpos, qvel, readings = np.array(self.motion.qpos), np.array(self.motion.qvel), []
+        recalls = any(self.pairs[k][0].port == "force" and self.pairs[k][0].recalls for k in candidate.effects)
+        earlier = tuple(map(np.array, self.motion.earlier)) if self.motion.earlier is not None and recalls else None
         channels = [c.name for c in self.system.channels]
         for k, place in sensors:
             effect, name = self.pairs[k]
@@ -395,9 +397,26 @@ class Scene(CandidatesOf):
                 along_v = np.zeros_like(along_v)
             else:
                 qvel[..., v] = new_v
+            if earlier is not None:
+                past = restore_readings(
+                    effect, self.names[k], self.system.dt, prompt, *self._numbers_at(k, p[place]), *self._before(q, v)
+                )
+                earlier[0][..., q], earlier[1][..., v] = past[0], earlier[1][..., v] if prompt else past[1]
             own = slice(place.start - self.d, place.stop - self.d)
             readings.append(_Reading(channels.index(at(name)), v, own, along, along_v, slope))
-        return dataclasses.replace(self.motion, qpos=_device(qpos), qvel=_device(qvel)), readings
+        restored = dataclasses.replace(self.motion, qpos=_device(qpos), qvel=_device(qvel))
+        if earlier is not None:
+            restored = dataclasses.replace(restored, earlier=tuple(map(_device, earlier)))
+        return restored, readings
+
+    def _before(self, q: int, v: int) -> tuple[np.ndarray, ...]:
+        """Times of all rows before windows, and a joint's positions, velocities and two rates of these."""
+        assert self.motion.earlier is not None
+        position, velocity = np.asarray(self.motion.earlier[0])[..., q], np.asarray(self.motion.earlier[1])[..., v]
+        dt = self.system.dt
+        rows = np.asarray(self.motion.start)[:, None] + dt * np.arange(-position.shape[1], 0)
+        rate = np.gradient(velocity, dt, axis=1)
+        return rows, position, velocity, rate, np.gradient(rate, dt, axis=1)
 
     def _drive(self, candidate: Candidate, p: Float[np.ndarray, " k"], around: _Around, pushes: _Pushes) -> None:
         """What a candidate's effects on commands change in forces: those of the same actuators one after the other."""
@@ -487,10 +506,10 @@ class Scene(CandidatesOf):
 
         A row is a step of what they remember, and the first command of all had been held for long.
         """
-        assert self.motion.earlier is not None
+        assert around.motion.earlier is not None
         position, velocity = (
             np.asarray(x)[..., i]
-            for x, i in zip(self.motion.earlier, (int(self.model.jnt_qposadr[joint]), self._dof(joint)), strict=True)
+            for x, i in zip(around.motion.earlier, (int(self.model.jnt_qposadr[joint]), self._dof(joint)), strict=True)
         )
         past, dt = np.asarray(self.motion.past), self.system.dt
         times = np.asarray(self.motion.start)[:, None] + dt * np.arange(-past.shape[1], 0)
@@ -527,11 +546,11 @@ class Scene(CandidatesOf):
 
     def _earlier(self, joint: int, around: _Around) -> tuple[Array, ...] | None:
         """Positions and velocities of a joint before the windows, and what actuators exerted on it."""
-        if self.motion.earlier is None:
+        if around.motion.earlier is None:
             return None
         key = ("earlier", joint)
         if key not in around.kept:
-            position, velocity = self.motion.earlier
+            position, velocity = around.motion.earlier
             place = int(self.model.jnt_qposadr[joint]), self._dof(joint)
             driving, theta = tuple(actuators_of(self.model, joint)), around.p[: self.d]
             around.kept[key] = _look_back(

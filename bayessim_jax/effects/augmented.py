@@ -27,7 +27,7 @@ from bayessim_jax.effects.commands import (
 from bayessim_jax.effects.contract import Numbers
 from bayessim_jax.effects.drive import probe_inertia, read_numbers
 from bayessim_jax.effects.forces import add_forces, begin_joints, recall_motion
-from bayessim_jax.effects.readings import begin_late, distort, restore, sensors, track
+from bayessim_jax.effects.readings import begin_late, distort, restore, restore_motion, sensors, track
 from bayessim_jax.effects.rig import AugmentedState, Grip, Rig
 from bayessim_jax.effects.wiring import Wired, edit_model
 from bayessim_jax.engines.contract import Engine
@@ -125,6 +125,8 @@ class AugmentedMjcf:
         bent = [w for _, w in sensors(rig) if not w.effect.remembers]
         still = jnp.zeros_like(qvel)
         qpos, qvel = restore(rig, bent, theta, names, qpos, qvel, time, still, still)
+        if motion is not None and any(w.effect.recalls for _, w in rig.at("force")):
+            motion = restore_motion(rig, theta, names, *motion, time)
         start = partial(self._start, theta, action=first, time=time, past=past, motion=motion, moves=moves)
         if not late:
             return start(qpos, qvel)

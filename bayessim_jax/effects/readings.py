@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bayessim_jax.contracts import Scalar
@@ -12,7 +14,7 @@ from bayessim_jax.effects.places import has_rate
 from bayessim_jax.effects.rig import AugmentedState, Rig, as_arrays
 from bayessim_jax.effects.wiring import Wired
 
-__all__ = ["begin_late", "distort", "restore", "sensors", "track"]
+__all__ = ["begin_late", "distort", "restore", "restore_motion", "sensors", "track"]
 
 
 def sensors(rig: Rig) -> list[tuple[int, Wired]]:
@@ -84,3 +86,21 @@ def restore(
         if w.place.endswith("/qvel") or not prompt:
             qvel = qvel.at[v].set(velocity)
     return qpos, qvel
+
+
+def restore_motion(
+    rig: Rig,
+    theta: Float[Array, " d"],
+    channels: Collection[str],
+    qpos: Float[Array, "periods nq"],
+    qvel: Float[Array, "periods nv"],
+    time: Scalar,
+) -> tuple[Float[Array, "periods nq"], Float[Array, "periods nv"]]:
+    """The same of all control periods before a time."""
+    times, every = time - rig.dt * jnp.arange(len(qpos), 0, -1), [w for _, w in sensors(rig)]
+    late = any(w.effect.remembers for w in every)
+    if not every or (late and len(qpos) < 2):
+        return qpos, qvel
+    rate = jnp.asarray(jnp.gradient(qvel, rig.dt, axis=0)) if late else jnp.zeros_like(qvel)
+    seen = (qpos, qvel, times, rate, jnp.asarray(jnp.gradient(rate, rig.dt, axis=0)) if late else rate)
+    return jax.vmap(lambda *row: restore(rig, every, theta, channels, *row))(*seen)

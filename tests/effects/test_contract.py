@@ -352,6 +352,31 @@ def test_a_rotor_remembers_what_arrived_of_commands(effect, values):
         assert bend == pytest.approx(wanted, abs=0.01)
 
 
+@pytest.mark.parametrize(
+    ("effect", "values"), [("sensor_offset", [0.2]), ("sensor_scale", [1.3]), ("sensor_delay", [0.015])]
+)
+def test_a_rotor_remembers_the_motion_behind_what_was_shown(effect, values):
+    """A spring is bent by what the joint did, and not by what a sensor made of it."""
+    base = system(*MODELS["pendulum"])
+    pairs = [("joint_flexibility", "joint/hinge"), (effect, "joint/hinge/qpos")]
+    augmented = with_effects(base, [(EFFECTS[n], p) for n, p in pairs], Scales(period=base.dt))
+    theta, actions = jnp.array([0.5, 8.0, 0.05, 0.005, *values]), jnp.asarray(chirp(80, force=0.5), float)
+    begun = augmented.begin(theta, jnp.array([0.3]), jnp.zeros(1), actions[0])
+    states = augmented.replay(theta, begun, actions)
+    states = jax.tree.map(lambda first, after: jnp.concatenate([first[None], after]), begun, states)
+    place = [channel.name for channel in base.channels].index("joint/hinge/qpos")
+    shown = jax.vmap(lambda s: augmented.observe(theta, s))(states)[:, place, None]
+    velocities = jax.vmap(augmented.velocities)(states)
+    for k in (40, 50, 60, 70):
+        motion = shown[:k], velocities[:k]
+        recalled = augmented.begin(
+            theta, shown[k], velocities[k], actions[k], time=0.01 * k, motion=motion, past=actions[:k]
+        )
+        bend = float(recalled.memories[0][0] - augmented.positions(recalled)[0])
+        wanted = float(states.memories[0][0][k] - augmented.positions(jax.tree.map(lambda x: x[k], states))[0])  # noqa: B023
+        assert bend == pytest.approx(wanted, abs=0.015)
+
+
 def test_what_a_system_lacks_is_told():
     base = system(*MODELS["pendulum"])
     with pytest.raises(ValueError, match="no hinge or slide 'knee'"):
