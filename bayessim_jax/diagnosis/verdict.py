@@ -64,6 +64,8 @@ TWINS = {
 
 Where one is found, the others are tried.
 """
+SAME = 0.001
+"""Share of what one of two twins leaves, by which the other may leave another share of the misfit and say the same."""
 MIMICRY = 0.05
 """Chance that what looks like an effect is something else that is in no library."""
 VISIBLE = 0.5
@@ -305,7 +307,18 @@ def _tied(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> list
     tied = [entry for entry in entries if ties(entry, best, none, thresholds)]
     near = best.score - thresholds.blur * (best.score - none.score)
     simpler = (e for e in entries if e.score >= near and share_left(e.misfit, none.misfit) <= thresholds.form)
-    return tied + [e for e in simpler if e not in tied and any(has_special_case(other, e) for other in tied)]
+    tied += [e for e in simpler if e not in tied and any(has_special_case(other, e) for other in tied)]
+    return tied + [e for e in entries if e not in tied and any(_is_same(e, other, none) for other in tied)]
+
+
+def _is_same(entry: Entry, other: Entry, none: Entry) -> bool:
+    """Whether a set has a twin in another one's place and leaves the same: what tells them apart is no misfit."""
+    (mine, its) = (sorted(set(e.names) - set(o.names)) for e, o in ((entry, other), (other, entry)))
+    if len(mine) != 1 or len(its) != 1:
+        return False
+    (one, place), (two, where) = ((e.seats.get(n, n)).split("@", 1) for e, n in ((entry, mine[0]), (other, its[0])))
+    left, same = (share_left(e.misfit, none.misfit) for e in (entry, other))
+    return place == where and two in TWINS.get(one, ()) and abs(left - same) <= SAME * same
 
 
 def explains(entry: Entry, none: Entry, thresholds: Thresholds) -> bool:
