@@ -31,6 +31,7 @@ __all__ = [
     "draw_cases",
     "judge",
     "make_drawn",
+    "read_rows",
     "resumed",
     "summarize",
     "tabulate",
@@ -175,6 +176,11 @@ def judge(sealed: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Cases that a file of JSON lines holds."""
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
 def resumed(
     cases: Iterable[dict[str, Any]], out: Path | None, make: Callable[[Path, dict[str, Any]], dict[str, Any]]
 ) -> Iterator[dict[str, Any]]:
@@ -184,8 +190,7 @@ def resumed(
     """
     done: dict[int, dict[str, Any]] = {}
     if out is not None and out.exists():
-        rows = [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()]
-        done = {row["case"]["seed"]: row for row in rows}
+        done = {row["case"]["seed"]: row for row in read_rows(out)}
     for case in cases:
         row = done.get(case["seed"])
         if row is None or row["case"] != case:
@@ -344,8 +349,7 @@ def summarize(rows: list[dict[str, Any]]) -> str:
 
 def _read_judged(path: Path) -> list[dict[str, Any]]:
     """Rows of a file of cases, with what became of them."""
-    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    return [row | judge(row["sealed"], row) for row in rows]
+    return [row | judge(row["sealed"], row) for row in read_rows(path)]
 
 
 def tabulate(sets: dict[str, list[dict[str, Any]]]) -> str:
@@ -357,30 +361,32 @@ def tabulate(sets: dict[str, list[dict[str, Any]]]) -> str:
     heads += ("of no library refused", "alarms on clean ones", "s")
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for name, rows in sets.items():
-        outcomes = {group: [row["outcome"] for row in rows if row["case"]["group"] == group] for group in GROUPS}
-
-        def count(group: str, *which: str, outcomes: dict[str, list[str]] = outcomes) -> str:
-            return str(sum(outcome in which for outcome in outcomes[group]))
-
-        def share(group: str, *which: str, outcomes: dict[str, list[str]] = outcomes) -> str:
-            return f"{count(group, *which, outcomes=outcomes)} of {len(outcomes[group])}"
-
         cells = [
             name.removeprefix("concealed_").replace("_", " "),
             str(len(rows)),
-            share("single", "named", "among"),
-            count("single", "wrong", "crowd"),
-            share("weak", "named", "among"),
-            count("weak", "wrong", "crowd"),
-            share("pair", "named", "among"),
-            count("pair", "part"),
-            count("pair", "wrong", "crowd"),
-            share("unknown", "refused", "missed"),
-            share("clean", "false alarm"),
+            _share(rows, "single", "named", "among"),
+            str(_count(rows, "single", "wrong", "crowd")),
+            _share(rows, "weak", "named", "among"),
+            str(_count(rows, "weak", "wrong", "crowd")),
+            _share(rows, "pair", "named", "among"),
+            str(_count(rows, "pair", "part")),
+            str(_count(rows, "pair", "wrong", "crowd")),
+            _share(rows, "unknown", "refused", "missed"),
+            _share(rows, "clean", "false alarm"),
             f"{np.median([row['seconds'] for row in rows]):.0f}",
         ]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def _count(rows: list[dict[str, Any]], group: str, *outcomes: str) -> int:
+    """Cases of a group that came out so."""
+    return sum(row["case"]["group"] == group and row["outcome"] in outcomes for row in rows)
+
+
+def _share(rows: list[dict[str, Any]], group: str, *outcomes: str) -> str:
+    """The same, of all of the group."""
+    return f"{_count(rows, group, *outcomes)} of {sum(row['case']['group'] == group for row in rows)}"
 
 
 def _is_seen(row: dict[str, Any]) -> bool:

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from benchmarks.compilation import fresh_cache, make_room, watch_compilation
-from benchmarks.concealed import resumed
+from benchmarks.concealed import read_rows, resumed
 from benchmarks.peers import require_peers
 from benchmarks.timing import stopwatch
 
@@ -93,7 +93,7 @@ def identify_clean(options: Namespace) -> None:
 
 def _read(path: Path) -> list[dict[str, Any]]:
     """Records of cases; those that name no method are of the direct one."""
-    return [{"method": "direct", **json.loads(line)} for line in path.read_text(encoding="utf-8").splitlines()]
+    return [{"method": "direct", **row} for row in read_rows(path)]
 
 
 def _find_peer() -> Callable[..., Any] | None:

@@ -8,7 +8,6 @@ in `diagnosis.verdict.Thresholds` is chosen from it, and from no real recording.
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -18,7 +17,7 @@ import numpy as np
 
 from bayessim_jax.diagnosis.verdict import Thresholds, leaves_much
 from bayessim_jax.effects import EFFECTS
-from benchmarks.concealed import diagnose_drawn, draw_cases, judge, resumed
+from benchmarks.concealed import diagnose_drawn, draw_cases, judge, read_rows, resumed
 
 if TYPE_CHECKING:
     from argparse import Namespace
@@ -136,7 +135,7 @@ def hold_against_held_out(records: Sequence[Path]) -> str:
     The latter are finalists for an effect of no library, of older records the one that came closest; with a memory they
     are excused where their past is unknown.
     """
-    rows = [json.loads(line) for path in records for line in path.read_text(encoding="utf-8").splitlines()]
+    rows = [row for path in records for row in read_rows(path)]
     found, back = Counter[str](), Counter[str]()
     nearest: dict[bool, list[tuple[float, str]]] = {True: [], False: []}
     unknown = [row for row in rows if row["case"]["group"] == "unknown"]

@@ -370,9 +370,19 @@ class Scene(CandidatesOf):
     @cached_property
     def _rates(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Times of all rows, and accelerations and their rates along the motion."""
-        rows = np.asarray(self.motion.start)[:, None] + self.system.dt * np.arange(self.motion.qpos.shape[1])
-        acceleration = np.gradient(np.asarray(self.motion.qvel), self.system.dt, axis=1)
-        return rows, acceleration, np.gradient(acceleration, self.system.dt, axis=1)
+        return self._rates_of(np.arange(self.motion.qvel.shape[1]), self.motion.qvel)
+
+    @cached_property
+    def _rates_before(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same before the windows."""
+        assert self.motion.earlier is not None
+        return self._rates_of(np.arange(-self.motion.earlier[1].shape[1], 0), self.motion.earlier[1])
+
+    def _rates_of(self, rows: np.ndarray, qvel: Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same of rows by their numbers, from the first of a window on."""
+        dt = self.system.dt
+        acceleration = np.gradient(np.asarray(qvel), dt, axis=1)
+        return np.asarray(self.motion.start)[:, None] + dt * rows, acceleration, np.gradient(acceleration, dt, axis=1)
 
     def _restored(self, candidate: Candidate, p: np.ndarray) -> tuple[Motion, list[_Reading]]:
         """The true motion behind what sensors with effects showed, and what these do to readings of it."""
@@ -398,8 +408,10 @@ class Scene(CandidatesOf):
             else:
                 qvel[..., v] = new_v
             if earlier is not None:
+                rows, *rates = self._rates_before
+                seen = (rows, earlier[0][..., q], earlier[1][..., v], *(rate[..., v] for rate in rates))
                 past = restore_readings(
-                    effect, self.names[k], self.system.dt, prompt, *self._numbers_at(k, p[place]), *self._before(q, v)
+                    effect, self.names[k], self.system.dt, prompt, *self._numbers_at(k, p[place]), *seen
                 )
                 earlier[0][..., q], earlier[1][..., v] = past[0], earlier[1][..., v] if prompt else past[1]
             own = slice(place.start - self.d, place.stop - self.d)
@@ -408,15 +420,6 @@ class Scene(CandidatesOf):
         if earlier is not None:
             restored = dataclasses.replace(restored, earlier=tuple(map(_device, earlier)))
         return restored, readings
-
-    def _before(self, q: int, v: int) -> tuple[np.ndarray, ...]:
-        """Times of all rows before windows, and a joint's positions, velocities and two rates of these."""
-        assert self.motion.earlier is not None
-        position, velocity = np.asarray(self.motion.earlier[0])[..., q], np.asarray(self.motion.earlier[1])[..., v]
-        dt = self.system.dt
-        rows = np.asarray(self.motion.start)[:, None] + dt * np.arange(-position.shape[1], 0)
-        rate = np.gradient(velocity, dt, axis=1)
-        return rows, position, velocity, rate, np.gradient(rate, dt, axis=1)
 
     def _drive(self, candidate: Candidate, p: Float[np.ndarray, " k"], around: _Around, pushes: _Pushes) -> None:
         """What a candidate's effects on commands change in forces: those of the same actuators one after the other."""

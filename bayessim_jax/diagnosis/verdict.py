@@ -313,12 +313,9 @@ def _tied(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> list
 
 def _is_same(entry: Entry, other: Entry, none: Entry) -> bool:
     """Whether a set has a twin in another one's place and leaves the same: what tells them apart is no misfit."""
-    (mine, its) = (sorted(set(e.names) - set(o.names)) for e, o in ((entry, other), (other, entry)))
-    if len(mine) != 1 or len(its) != 1:
-        return False
-    (one, place), (two, where) = ((e.seats.get(n, n)).split("@", 1) for e, n in ((entry, mine[0]), (other, its[0])))
+    mine, its = _apart(entry, other)
     left, same = (share_left(e.misfit, none.misfit) for e in (entry, other))
-    return place == where and two in TWINS.get(one, ()) and abs(left - same) <= SAME * same
+    return len(mine) == len(its) == 1 and _are_twins(*mine, *its) and abs(left - same) <= SAME * same
 
 
 def explains(entry: Entry, none: Entry, thresholds: Thresholds) -> bool:
@@ -457,8 +454,13 @@ def contains(one: str, other: str) -> bool:
 
 def can_stand_for(one: str, other: str) -> bool:
     """Whether the first effect, at the same place, is a special case of the other or a twin of it."""
+    return contains(other, one) or _are_twins(one, other)
+
+
+def _are_twins(one: str, other: str) -> bool:
+    """Whether two effects look the same at one place."""
     (effect, _, place), (found, _, where) = one.partition("@"), other.partition("@")
-    return contains(other, one) or (place == where and effect in TWINS.get(found, ()))
+    return place == where and effect in TWINS.get(found, ())
 
 
 def are_siblings(one: str, other: str) -> bool:
@@ -475,11 +477,14 @@ def has_special_case(entry: Entry, other: Entry) -> bool:
 
 def _is_left(part: Entry, whole: Entry) -> bool:
     """Whether a set is what is left of another one without some effects and with special cases of some."""
-    less, more = (
-        [e.seats.get(name, name) for name in sorted(set(e.names) - set(o.names))]
-        for e, o in ((part, whole), (whole, part))
-    )
+    less, more = _apart(part, whole)
     return any(all(map(contains, chosen, less)) for chosen in permutations(more, len(less)))
+
+
+def _apart(one: Entry, other: Entry) -> tuple[list[str], list[str]]:
+    """What each of two sets has that the other has not, at joints."""
+    mine, its = set(one.names) - set(other.names), set(other.names) - set(one.names)
+    return [one.seats.get(name, name) for name in sorted(mine)], [other.seats.get(name, name) for name in sorted(its)]
 
 
 def _weigh(result: Diagnosis, group: Int[np.ndarray, " windows"], temper: float) -> list[float]:

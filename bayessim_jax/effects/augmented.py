@@ -125,7 +125,7 @@ class AugmentedMjcf:
         bent = [w for _, w in sensors(rig) if not w.effect.remembers]
         still = jnp.zeros_like(qvel)
         qpos, qvel = restore(rig, bent, theta, names, qpos, qvel, time, still, still)
-        if motion is not None and any(w.effect.recalls for _, w in rig.at("force")):
+        if motion is not None and rig.recalls:
             motion = restore_motion(rig, theta, names, *motion, time)
         start = partial(self._start, theta, action=first, time=time, past=past, motion=motion, moves=moves)
         if not late:

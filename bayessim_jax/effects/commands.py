@@ -122,12 +122,12 @@ def pass_past(
 
     The first of them had been held for long; positions and velocities are those at the beginning of each period.
     """
-    columns, first = _limit(rig, numbers, past), state.time - len(past) * rig.dt
+    columns: list[Any] = _limit(rig, numbers, past)
+    first = state.time - len(past) * rig.dt
     for _, w in rig.at("act"):
         values, picked = w.values(theta), _pick(columns, w.site)
         moment = rig.see_actuator(numbers, state, w.site)._replace(time=first, h=rig.dt)
-        held = jax.tree.map(lambda column: column[0], picked)
-        memory = as_arrays(w.effect.begin(values, held, moment), first)
+        memory = begin_one(w, theta, [column[0] for column in columns], moment)[1]
         if not w.effect.looks:
             new = w.effect.ahead(values, memory, picked, moment)[0]
         else:

@@ -97,7 +97,7 @@ def recall_motion(
     recalled, physics = {}, state.base.physics
     unsettled = [k for k, w in rig.at("force") if not w.effect.settles]
     recorded = recorded_steps(state.time, len(qpos), rig.dt)
-    if rig.at("act") and any(w.effect.recalls for _, w in rig.at("force")):
+    if rig.at("act") and rig.recalls:
         ctrl = pass_past(rig, theta, numbers, state, ctrl, qpos, qvel)
     for k, w in rig.at("force"):
         if w.effect.recalls:

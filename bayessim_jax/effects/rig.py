@@ -74,6 +74,11 @@ class Rig:
         """The effects of a port with their numbers."""
         return [(k, w) for k, w in enumerate(self.effects) if w.effect.port == port]
 
+    @property
+    def recalls(self) -> bool:
+        """Whether an effect remembers how its joint has moved."""
+        return any(w.effect.recalls for _, w in self.at("force"))
+
     def address(self, joint: int) -> tuple[int, int]:
         """Where a joint stands in qpos and qvel."""
         return int(self.model.jnt_qposadr[joint]), int(self.model.jnt_dofadr[joint])

@@ -128,15 +128,10 @@ def test_normal_equations_are_those_of_all_derivatives(problem, effects):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), curvature, asked)
 
 
-@pytest.mark.parametrize("effects", [(0, 2), (2, 3), (3, 2), (5, 2), (2, 5)])
-def test_effects_beside_others_have_the_slopes_of_differences(problem, effects):
-    """Commands pass one effect after the other, and friction holds against what they then exert."""
-    pairs = [*problem.pairs, (EFFECTS["back_emf"], "actuator/motor")]
-    scene = problem.screen(pairs).scene
-    candidate, p = Candidate(effects), np.zeros(scene.d + scene.slots)
-    count = scene.count(candidate)
+def has_the_slopes_of_differences(scene, candidate):
+    p, count = np.zeros(scene.d + scene.slots), scene.count(candidate)
     p[scene.d : scene.d + count] = 0.3 * np.random.default_rng(0).normal(size=count)
-    sigma, still = jnp.full(len(problem.system.channels), 0.1), jnp.zeros((len(scene.motion.start), 2))
+    sigma, still = jnp.full(len(scene.system.channels), 0.1), jnp.zeros((len(scene.motion.start), 2))
     here, slopes = scene.expand(candidate, p, still, sigma)
     for k in range(scene.d, scene.d + count):
         ahead, behind = (
@@ -144,6 +139,13 @@ def test_effects_beside_others_have_the_slopes_of_differences(problem, effects):
         )
         asked = -np.asarray(slopes)[:, k].reshape(here.shape)
         np.testing.assert_allclose(asked, (ahead - behind) / 2e-5, atol=1e-3 * np.abs(asked).max())
+
+
+@pytest.mark.parametrize("effects", [(0, 2), (2, 3), (3, 2), (5, 2), (2, 5)])
+def test_effects_beside_others_have_the_slopes_of_differences(problem, effects):
+    """Commands pass one effect after the other, and friction holds against what they then exert."""
+    pairs = [*problem.pairs, (EFFECTS["back_emf"], "actuator/motor")]
+    has_the_slopes_of_differences(problem.screen(pairs).scene, Candidate(effects))
 
 
 @pytest.mark.parametrize("effects", [(0, 2), (1, 2), (0, 1, 2), (1, 3)])
@@ -155,18 +157,8 @@ def test_what_arrived_of_commands_before_a_window_has_the_slopes_of_differences(
     first = [np.asarray(x)[:, :1] for x in (problem.motion.qpos, problem.motion.qvel)]
     earlier = first[0] + first[1] * steps, first[1] + 0.0 * steps
     motion = dataclasses.replace(problem.motion, earlier=tuple(map(jnp.asarray, earlier)))
-    scene = dataclasses.replace(problem, motion=motion).screen([(EFFECTS[name], place) for name, place in named]).scene
-    candidate, p = Candidate(effects), np.zeros(scene.d + scene.slots)
-    count = scene.count(candidate)
-    p[scene.d : scene.d + count] = 0.3 * np.random.default_rng(0).normal(size=count)
-    sigma, still = jnp.full(len(problem.system.channels), 0.1), jnp.zeros((len(scene.motion.start), 2))
-    here, slopes = scene.expand(candidate, p, still, sigma)
-    for k in range(scene.d, scene.d + count):
-        ahead, behind = (
-            scene.expand(candidate, p + e * (np.arange(p.size) == k), still, sigma)[0] for e in (1e-5, -1e-5)
-        )
-        asked = -np.asarray(slopes)[:, k].reshape(here.shape)
-        np.testing.assert_allclose(asked, (ahead - behind) / 2e-5, atol=1e-3 * np.abs(asked).max())
+    screen = dataclasses.replace(problem, motion=motion).screen([(EFFECTS[name], place) for name, place in named])
+    has_the_slopes_of_differences(screen.scene, Candidate(effects))
 
 
 def test_a_pair_on_one_motor_is_found_in_the_order_of_the_machine(problem, tmp_path):

@@ -268,6 +268,22 @@ def test_a_special_case_stands_for_what_contains_it():
     assert not are_kin("coulomb_friction@joint/a", "coulomb_friction@joint/b")
 
 
+@pytest.mark.parametrize(
+    ("other", "left", "sets"),
+    [
+        ("viscous_friction@joint/a", 0.0020001, 2),
+        ("viscous_friction@joint/a", 0.0021, 1),  # not the same
+        ("viscous_friction@joint/b", 0.0020001, 1),  # not there
+        ("quadratic_drag@joint/a", 0.0020001, 1),  # no twin
+    ],
+)
+def test_twins_that_leave_the_same_are_told_together(other, left, sets):
+    """Scores tell the two apart by far more than chance, and no misfit does."""
+    best, second = entry(["back_emf@actuator/m"], 1000.0, 0.002), entry([other], 900.0, left)
+    best.seats = {"back_emf@actuator/m": "back_emf@joint/a"}
+    assert len(verdict(best, second).confusion) == sets
+
+
 def test_a_set_stands_for_all_that_it_is_left_of():
     def friction(at_a, at_b, *more, seed=0):
         return entry([f"{at_a}@joint/a", f"{at_b}@joint/b", *more], 100.0, 0.0, seed=seed)

@@ -313,6 +313,12 @@ def test_a_long_past_is_gone_through_in_few_steps():
     assert abs(float(short.memories[1]) - wanted) > 0.15
 
 
+def every_state(augmented, theta, begun, actions):
+    """The one that a replay begins in, and those after each control period."""
+    after = augmented.replay(theta, begun, actions)
+    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), begun, after)
+
+
 @pytest.mark.parametrize(("yields", "move", "tolerance"), [(0.05, 0.0, 0.15), (0.5, -3.0, 0.01)])
 def test_a_bent_joint_remembers_how_it_has_moved(yields, move, tolerance):
     """Whatever it was before, where it yields soon; where it does not, what it was before is asked for."""
@@ -320,8 +326,7 @@ def test_a_bent_joint_remembers_how_it_has_moved(yields, move, tolerance):
     augmented = with_effects(base, [(EFFECTS["hysteresis"], "joint/hinge")], Scales(position=20.0 * yields))
     theta, actions = start_of(augmented), jnp.asarray(chirp(80, force=0.5), float)
     begun = augmented.begin(theta, jnp.array([0.3]), jnp.zeros(1), actions[0])
-    states = augmented.replay(theta, begun, actions)
-    states = jax.tree.map(lambda first, after: jnp.concatenate([first[None], after]), begun, states)
+    states = every_state(augmented, theta, begun, actions)
     middle = jax.tree.map(lambda x: x[60], states)
     motion = tuple(jax.vmap(read)(states)[:60] for read in (augmented.positions, augmented.velocities))
     where = (augmented.positions(middle), augmented.velocities(middle), actions[60])
@@ -341,8 +346,7 @@ def test_a_rotor_remembers_what_arrived_of_commands(effect, values):
     augmented = with_effects(base, [(EFFECTS[n], p) for n, p in pairs], Scales())
     theta, actions = jnp.array([0.5, 8.0, 0.05, 0.005, *values]), jnp.asarray(chirp(80, force=0.5), float)
     begun = augmented.begin(theta, jnp.array([0.3]), jnp.zeros(1), actions[0])
-    states = augmented.replay(theta, begun, actions)
-    states = jax.tree.map(lambda first, after: jnp.concatenate([first[None], after]), begun, states)
+    states = every_state(augmented, theta, begun, actions)
     for k in (40, 50, 60, 70):
         middle = jax.tree.map(lambda x: x[k], states)  # noqa: B023
         motion = tuple(jax.vmap(read)(states)[:k] for read in (augmented.positions, augmented.velocities))
@@ -362,8 +366,7 @@ def test_a_rotor_remembers_the_motion_behind_what_was_shown(effect, values):
     augmented = with_effects(base, [(EFFECTS[n], p) for n, p in pairs], Scales(period=base.dt))
     theta, actions = jnp.array([0.5, 8.0, 0.05, 0.005, *values]), jnp.asarray(chirp(80, force=0.5), float)
     begun = augmented.begin(theta, jnp.array([0.3]), jnp.zeros(1), actions[0])
-    states = augmented.replay(theta, begun, actions)
-    states = jax.tree.map(lambda first, after: jnp.concatenate([first[None], after]), begun, states)
+    states = every_state(augmented, theta, begun, actions)
     place = [channel.name for channel in base.channels].index("joint/hinge/qpos")
     shown = jax.vmap(lambda s: augmented.observe(theta, s))(states)[:, place, None]
     velocities = jax.vmap(augmented.velocities)(states)
