@@ -492,8 +492,8 @@ def _weigh(result: Diagnosis, group: Int[np.ndarray, " windows"], temper: float)
 
     Weights of all candidates by their held-out scores, tempered to what these can resolve, under the Bayesian
     bootstrap of the recordings, or of windows where these are few; what a set left out as needlessly complex has goes
-    to the sets that stand for it. Of that, the share of the misfit that a set explains, and the chance that nothing
-    outside the library looks like it.
+    to the sets that stand for it, and twins that leave the same have as much as each other. Of that, the share of the
+    misfit that a set explains, and the chance that nothing outside the library looks like it.
 
     Source: Yao et al. 2018, section 3.4 (pseudo-BMA+)
     """
@@ -510,5 +510,9 @@ def _weigh(result: Diagnosis, group: Int[np.ndarray, " windows"], temper: float)
         if not any(entry is chosen for chosen in result.confusion):
             stands = np.array([_is_left(chosen, entry) for chosen in result.confusion], float)
             own = own + (weight * stands / stands.sum() if stands.any() else 0.0)
-    explained = [1.0 - share_left(entry.misfit, result.baseline.misfit) for entry in result.confusion]
+    # what tells twins apart that leave the same is no misfit, and says nothing of which it is
+    none, sets = result.baseline, result.confusion
+    same = np.array([[one is other or _is_same(one, other, none) for other in sets] for one in sets], float)
+    own = same @ own / same.sum(1)
+    explained = [1.0 - share_left(entry.misfit, none.misfit) for entry in sets]
     return [float((1.0 - MIMICRY) * w * part) for w, part in zip(own, explained, strict=True)]

@@ -281,7 +281,9 @@ def test_twins_that_leave_the_same_are_told_together(other, left, sets):
     """Scores tell the two apart by far more than chance, and no misfit does."""
     best, second = entry(["back_emf@actuator/m"], 1000.0, 0.002), entry([other], 900.0, left)
     best.seats = {"back_emf@actuator/m": "back_emf@joint/a"}
-    assert len(verdict(best, second).confusion) == sets
+    found = verdict(best, second)
+    assert len(found.confusion) == sets
+    assert found.probabilities == pytest.approx([0.95 / sets] * sets, abs=0.01)
 
 
 def test_a_set_stands_for_all_that_it_is_left_of():
