@@ -168,6 +168,11 @@ def _miss(engine: Any, substeps: int, row: tuple[Array, ...], move: Array, force
     return jnp.concatenate([separate(engine.model, q_next, engine.qpos(after)), engine.qvel(after) - v_next])
 
 
+def _miss_all(engine: Any, substeps: int, motion: Motion, move: Array, force: Array, inner: Array) -> Array:
+    """The same of every row of every window."""
+    return jax.vmap(jax.vmap(lambda *row: _miss(engine, substeps, row, move, force, inner)))(*_rows(motion))
+
+
 @struct.dataclass
 class Beside:
     """Points beside a motion from which steps are taken: k of them, the first is the motion itself."""
@@ -185,12 +190,9 @@ def find_gaps(
 ) -> Float[Array, "k windows steps n"]:
     """Where every row's step leads from several points, less the next row; only the first `count` are looked at."""
 
-    def gap(x: Float[Array, " m"], move: Float[Array, " n"], force: Float[Array, " nv"]) -> Array:
-        inner = numbers(x)
-        return jax.vmap(jax.vmap(lambda *row: _miss(engine, substeps, row, move, force, inner)))(*_rows(motion))
-
     def put(k: Array, every: Array) -> Array:
-        return every.at[k].set(gap(beside.x[k], beside.move[k], beside.force[k]))
+        inner = numbers(beside.x[k])
+        return every.at[k].set(_miss_all(engine, substeps, motion, beside.move[k], beside.force[k], inner))
 
     shape = (len(beside.x), *motion.ctrl.shape[:2], 2 * engine.model.nv)
     return jax.lax.fori_loop(0, count, put, jnp.zeros(shape))
@@ -233,14 +235,41 @@ def differ(
     return Linearized(lin.a, jnp.where(forced, slopes(ways.force), lin.b), along, gap)
 
 
-@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
-def move_steps(lin: Linearized, gap: Float[Array, "windows steps n"], shift: Float[Numbers, " d"]) -> Linearized:
-    """Linearized steps where only θ is another, by `shift`, and the `gap` with it; forces do what `heavier` says."""
-    if lin.heavier is None:
-        return Linearized(lin.a, lin.b, lin.along, gap)
-    grown = jnp.eye(lin.b.shape[-1]) + jnp.einsum("wtdij,d->wtij", lin.heavier, shift)
-    turned = jnp.linalg.solve(jnp.swapaxes(grown, -1, -2), jnp.swapaxes(lin.b, -1, -2))
-    return Linearized(lin.a, jnp.swapaxes(turned, -1, -2), lin.along, gap, lin.heavier)
+@trace_once(static_argnames=("engine", "numbers", "substeps"), compiler_options=COMPILER_OPTIONS)
+def move_steps(
+    engine: Any,
+    numbers: Any,
+    motion: Motion,
+    x: Float[Numbers, " m"],
+    b: Float[Array, "windows steps n nv"],
+    heavier: Float[Array, "windows steps d nv nv"] | None,
+    shift: Float[Numbers, " d"],
+    substeps: int,
+) -> tuple[Float[Array, "windows steps n"], Float[Array, "windows steps n nv"], Bool[Array, ""]]:
+    """`gap` and `b` of linearized steps where only θ is another, by `shift`; forces do what `heavier` says.
+
+    And whether every joint gives way to a force on it: inertia that is not linear in θ may come out negative.
+    """
+    nv = engine.model.nv
+    gap = _miss_all(engine, substeps, motion, jnp.zeros(2 * nv), jnp.zeros(nv), numbers(x))
+    if heavier is not None:
+        b = _divide(b, jnp.eye(nv) + jnp.einsum("wtdij,d->wtij", heavier, shift))
+    return gap, b, (jnp.diagonal(b[..., nv:, :], axis1=-2, axis2=-1) > 0.0).all()
+
+
+def _divide(b: Float[Array, "windows steps n nv"], by: Float[Array, "windows steps nv nv"]) -> Array:
+    """b by⁻¹ for many small matrices that are near to positive multiples of 1: elimination without a choice of pivots.
+
+    Written out, for a solver that is called for each of them takes six times as long.
+    """
+    nv = by.shape[-1]
+    rows, found = [[by[..., j, i] for j in range(nv)] for i in range(nv)], [b[..., i] for i in range(nv)]
+    for k in range(nv):
+        for i in (i for i in range(nv) if i != k):
+            share = rows[i][k] / rows[k][k]
+            rows[i][k + 1 :] = [x - share * y for x, y in zip(rows[i][k + 1 :], rows[k][k + 1 :], strict=True)]
+            found[i] = found[i] - share[..., None] * found[k]
+    return jnp.stack([found[k] / rows[k][k][..., None] for k in range(nv)], -1)
 
 
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)

@@ -273,9 +273,11 @@ class Scene(CandidatesOf):
         exerts = any(self.pairs[k][0].port in ("force", "act") for k in candidate.effects)
         lin = None
         if base and not moves and not base.edits:
-            gap = self._find_gaps(motion, self._stay(candidate, p, 1), 1)[0]
-            lin = move_steps(base.lin, gap, self._theta(p) - self._theta(base.p))
-        if lin is None or not _gives_way(lin, self.model.nv):
+            x, shift = self._full(candidate, p), self._theta(p) - self._theta(base.p)
+            at_work = (base.lin.b, base.lin.heavier, shift, self.system.substeps)
+            gap, b, gives_way = move_steps(self.engine, self.numbers, motion, x, *at_work)
+            lin = dataclasses.replace(base.lin, gap=gap, b=b) if gives_way else None
+        if lin is None:
             forced = base is None or exerts
             count, beside, ways = self._look_beside(candidate, p, moves, forced, base is None)
             gaps = self._find_gaps(motion, beside, count)
@@ -326,7 +328,7 @@ class Scene(CandidatesOf):
             some = jax.tree.map(lambda x: np.resize(x[first : first + TOGETHER], (TOGETHER, x.shape[1])), beside)  # noqa: B023
             here = min(max(count - first, 0), len(beside.x) - first)
             found.append(find_gaps(self.engine, self.numbers, motion, some, here, self.system.substeps))
-        return (jnp.concatenate(found) if len(found) > 1 else found[0])[: len(beside.x)]
+        return jnp.concatenate(found)[: len(beside.x)] if len(beside.x) != TOGETHER else found[0]
 
     @property
     def _pushing(self) -> Float[np.ndarray, " nv"]:
@@ -675,17 +677,15 @@ class _EngineNumbers:
         return isinstance(other, _EngineNumbers) and other._key == self._key
 
     def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
         return hash(self._key)
 
     @property
     def _key(self) -> tuple[Any, ...]:
         return self.engine, self.writes, self.margins, self.edits, self.kinds
-
-
-def _gives_way(lin: Linearized, nv: int) -> bool:
-    """Whether every joint gives way to a force on it: inertia that is not linear in θ may come out negative."""
-    along = np.einsum("...ii->...i", np.asarray(lin.b)[..., nv:, :])
-    return bool((along > 0.0).all())
 
 
 def _device(x: np.ndarray) -> Array:
