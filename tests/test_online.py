@@ -70,7 +70,7 @@ def test_the_shorter_the_memory_the_more_sets_it_is_judged_by(history, sets):
         make(calibrations=-1)
 
 
-def test_kept_sets_are_fitted_from_the_next_round_on_where_they_tell_of_recordings_in_use(cartpole, run):
+def test_kept_sets_are_fitted_from_the_next_round_on_where_they_tell_of_recordings_in_use(cartpole):
     given = []
 
     @struct.dataclass
@@ -83,6 +83,7 @@ def test_kept_sets_are_fitted_from_the_next_round_on_where_they_tell_of_recordin
 
     setup, target = cartpole
     spy = Spy(**{field.name: getattr(TINY, field.name) for field in dataclasses.fields(TINY)})
+    run = jax.jit(online.run, static_argnames="rounds")
     state, _ = run(jax.random.key(3), setup.replace(estimator=spy), target, rounds=3)
     jax.effects_barrier()
     assert len(given) == 3

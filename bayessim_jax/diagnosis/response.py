@@ -258,7 +258,7 @@ def move_steps(
 
 
 def _divide(b: Float[Array, "windows steps n nv"], by: Float[Array, "windows steps nv nv"]) -> Array:
-    """b by⁻¹ for many small matrices that are near to positive multiples of 1: elimination without a choice of pivots.
+    """Many small matrices b by⁻¹, `by` near to positive multiples of 1: elimination without a choice of pivots.
 
     Written out, for a solver that is called for each of them takes six times as long.
     """

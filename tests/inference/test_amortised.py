@@ -72,6 +72,7 @@ def test_a_linear_simulator_has_the_posterior_that_algebra_gives():
 
 def test_the_same_seed_gives_the_same_draws_and_another_does_not(monkeypatch):
     monkeypatch.setattr(networks, "ROUNDS", 1)
+    monkeypatch.setattr(networks, "SCHEDULE", networks.SCHEDULE.replace(epochs=2))
     shots = made([0.2, 0.4], seed=1)
     first, again, other = (np.asarray(amortised(shots, seed, draws=100).draws) for seed in (3, 3, 4))
     np.testing.assert_array_equal(first, again)
@@ -81,6 +82,7 @@ def test_the_same_seed_gives_the_same_draws_and_another_does_not(monkeypatch):
 def test_what_no_simulation_shows_is_doubted(monkeypatch):
     """A wave in the middle of every window that neither parameter nor noise explains."""
     monkeypatch.setattr(networks, "ROUNDS", 1)
+    monkeypatch.setattr(networks, "SCHEDULE", networks.SCHEDULE.replace(epochs=2))
     shots = made([0.7, -1.1])
     wave = 10 * SIGMA * jnp.sin(jnp.linspace(0.0, 2 * jnp.pi, ROWS))[:, None]
     odd = amortised(dataclasses.replace(shots, y=shots.y + wave), draws=100)

@@ -85,7 +85,7 @@ def test_the_step_of_what_was_recorded_is_found_and_does_not_bend_parameters(tmp
     assert (np.abs(np.asarray(plain.z) - truth) > 8 * sd[:-1]).any()
 
 
-@pytest.mark.parametrize("rig", ["slide", "double"])
+@pytest.mark.parametrize("rig", ["slide", pytest.param("double", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("finer", [0.25, 1.0, 16.0])
 def test_positions_and_velocities_tell_the_step_whatever_moves_the_machine(tmp_path, rig, finer):
     settings = {"strength": 0.3, "recordings": 4, "seconds": 3.0, "rate": 125.0, "seed": 2}
