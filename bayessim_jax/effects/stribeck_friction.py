@@ -5,9 +5,12 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from bayessim_jax.effects.contract import EffectParameter, Memory, Moment, Number, Scales, Values
-from bayessim_jax.effects.dry_friction import DryFriction
+from bayessim_jax.effects.dry_friction import ONSET, DryFriction
 
 __all__ = ["StribeckFriction"]
+
+SHARP = 0.5
+"""Share of v_s up to which the sign may be rounded: what falls off within that is how friction begins."""
 
 
 class StribeckFriction(DryFriction):
@@ -15,7 +18,8 @@ class StribeckFriction(DryFriction):
 
         F(v) = F_c + max(F_s − F_c, 0) exp(−(v/v_s)²)
 
-    τ = −clip(m (v/h + a), ±F(v)). F_c and F_s in N m or N, v_s in rad/s or m/s.
+    τ = −clip(m (v/h + a), ±F(v)). F_c and F_s in N m or N, v_s in rad/s or m/s. The onset of a sign that is `rounded`
+    counts up to v_s/2: a fall within it would be another form of plain dry friction's sign.
 
     Source: Armstrong-Hélouvry, Dupont and Canudas de Wit 1994
     """
@@ -46,4 +50,6 @@ class StribeckFriction(DryFriction):
         ratio = moment.velocity / values["velocity"]
         coulomb = values["coulomb"]
         level = coulomb + jnp.maximum(values["static"] - coulomb, 0.0) * jnp.exp(-ratio * ratio)
+        if self.rounded:
+            values = {**values, ONSET: jnp.minimum(values[ONSET], SHARP * values["velocity"])}
         return self.resist(values, moment, level, level), memory

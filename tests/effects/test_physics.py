@@ -92,7 +92,7 @@ def test_friction_holds_a_pendulum_against_gravity_without_creep(dtype):
     [
         ("coulomb_friction", [3.0]),
         ("asymmetric_friction", [3.0, 1.0]),
-        ("stribeck_friction", [3.0, 3.0, 0.1]),
+        ("stribeck_friction", [3.0, 3.0, 1.0]),
         ("load_dependent_friction", [3.0, 0.0]),
     ],
 )
@@ -105,6 +105,14 @@ def test_a_rounded_sign_lets_a_joint_creep_below_its_onset_and_no_further(name, 
     assert float(creeping[-1, 1]) == pytest.approx(0.5 * onset, rel=1e-3, abs=1e-8)
     sliding = run(base, [(rounded, RAIL)], [*values, onset], push(3.5, 600), 0.0, 0.0, MASS)
     assert float(sliding[-1, 1] - sliding[-101, 1]) == pytest.approx((3.5 - 3.0) / MASS, rel=1e-3)
+
+
+@pytest.mark.parametrize(("onset", "counts"), [(0.02, 0.02), (0.05, 0.05), (0.2, 0.05)])
+def test_a_sign_is_not_rounded_beyond_half_of_the_speed_at_which_friction_falls(onset, counts):
+    """Or a fall within the onset would be another form of the sign of friction that does not fall."""
+    base, rounded = system(cart(0.002, "0 0 -9.81"), "cart"), open_form(EFFECTS["stribeck_friction"])
+    creeping = run(base, [(rounded, RAIL)], [3.0, 3.0, 0.1, onset], push(1.5, 600), 0.0, 0.0, MASS)
+    assert float(creeping[-1, 1]) == pytest.approx(0.5 * counts, rel=1e-3)
 
 
 def test_a_form_is_open_only_in_what_asks_for_it():
