@@ -328,7 +328,7 @@ class Scene(CandidatesOf):
             some = jax.tree.map(lambda x: np.resize(x[first : first + TOGETHER], (TOGETHER, x.shape[1])), beside)  # noqa: B023
             here = min(max(count - first, 0), len(beside.x) - first)
             found.append(find_gaps(self.engine, self.numbers, motion, some, here, self.system.substeps))
-        return jnp.concatenate(found)[: len(beside.x)] if len(beside.x) != TOGETHER else found[0]
+        return (jnp.concatenate(found) if len(found) > 1 else found[0])[: len(beside.x)]
 
     @property
     def _pushing(self) -> Float[np.ndarray, " nv"]:
