@@ -56,12 +56,21 @@ class FlexibleForce(ForceEffect):
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
         """The weighted sum."""
-        phi = features(moment.position, moment.velocity, moment.drive, values)
-        return values["force"] * (jnp.stack([values[f"w{k}"] for k in range(FEATURES)]) @ phi), memory
+        weights = jnp.stack([values[f"w{k}"] for k in range(FEATURES)])
+        return weights @ _forces(values, moment), memory
+
+    def slopes(self, values: Values, moment: Moment) -> Float[Array, " numbers"]:
+        """Along the weights F φ_k, and 0 along the units, which do not move."""
+        return jnp.append(_forces(values, moment), jnp.zeros(len(UNITS)))
 
 
 FLEXIBLE = FlexibleForce()
 """The one there is: programs that it stands in are found again."""
+
+
+def _forces(values: Values, moment: Moment) -> Float[Array, " features"]:
+    """F φ_k."""
+    return values["force"] * features(moment.position, moment.velocity, moment.drive, values)
 
 
 def _fixed(name: str, value: float) -> EffectParameter:

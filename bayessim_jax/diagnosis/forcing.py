@@ -24,9 +24,6 @@ from bayessim_jax.programs import trace_once
 
 __all__ = ["Joint", "Partners", "Passed", "commands_of", "force_of", "pass_on", "restore_readings"]
 
-MANY = 12
-"""Parameters beyond which reverse-mode derivatives of every moment's force cost less than forward-mode ones."""
-
 
 @struct.dataclass
 class Joint:
@@ -103,10 +100,6 @@ def force_of(
         beside = None if other is None else other.moment(time, h)
         return joint.moment(time, h)._replace(detail=detail, other=beside)
 
-    def instant(x: Array, *now: Any) -> Array:
-        values = _named(names, x)
-        return effect.force(values, effect.begin(values, moment(*now)), moment(*now))[0]
-
     def force(x: Array, joint: Joint = joint, earlier: Any = earlier) -> Array:
         values = _named(names, x)
 
@@ -140,14 +133,15 @@ def force_of(
         here = numbers, joint.acceleration, joint.drive, drives
         moves = partners.own, partners.acceleration, partners.drive, None if drives is None else partners.before
         return jax.vmap(lambda *move: jax.jvp(among, here, move), out_axes=(None, -1))(*moves)
-    now = jax.tree.map(lambda a: a[0, 0], (time, joint, other))
-    remembers = jax.tree.leaves(effect.begin(_named(names, numbers), moment(*now)))
-    if numbers.size <= MANY or remembers:
+    values = _named(names, numbers)
+    if effect.slopes(values, moment(*jax.tree.map(lambda a: a[0, 0], (time, joint, other)))) is None:
         return _with_slopes(force, numbers, rates)
-    each = jax.vmap(jax.vmap(jax.value_and_grad(instant), (None, 0, 0, 0)), (None, 0, 0, 0))
-    mean = lambda f: f.reshape(len(time), -1, steps, *f.shape[2:]).mean(2)  # noqa: E731
-    f, along = each(numbers, time, joint, other)
-    return mean(f), rates * mean(along)
+
+    def both(*now: Any) -> tuple[Array, Array]:
+        return effect.force(values, (), moment(*now))[0], effect.slopes(values, moment(*now))
+
+    f, along = jax.vmap(jax.vmap(both))(time, joint, other)
+    return f.reshape(len(f), -1, steps).mean(-1), rates * along.reshape(len(f), -1, steps, along.shape[-1]).mean(2)
 
 
 @trace_once(

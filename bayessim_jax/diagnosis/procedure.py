@@ -51,10 +51,8 @@ __all__ = ["Problem", "detect", "is_mismatch", "name_effects"]
 
 T, R = TypeVar("T"), TypeVar("R")
 
-SCREENED, FEWEST = 60, 30
-"""Windows with which every candidate is tried at first, and how few will do where many things are measured."""
-NUMBERS = 15_000
-"""What was measured in these windows, from where on fewer will do."""
+SCREENED = 30
+"""Windows with which every candidate is tried at first."""
 FINALISTS, LEADERS, PAIRS = 7, 2, 4
 """Single effects that are simulated at most, at least, and pairs."""
 NEAR, ALIKE, VARIED = 0.75, 2, 2
@@ -167,8 +165,7 @@ class Problem:
     def screen(self, pairs: Sequence[tuple[Any, str]], slots: int = SLOTS) -> Screen:
         """Pairs to be held against some of the windows."""
         count = len(self.group)
-        enough = int(NUMBERS * count / max(np.asarray(self.shots.measured).sum(), 1))
-        rows = np.unique(np.linspace(0, count - 1, min(max(FEWEST, enough), SCREENED, count)).astype(int))
+        rows = np.unique(np.linspace(0, count - 1, min(SCREENED, count)).astype(int))
         every = (self.motion, self.shots.inputs, self.shots.y, self.shots.measured)
         motion, inputs, y, measured = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[rows]), every)
         shots = dataclasses.replace(self.shots, inputs=inputs, y=y, measured=measured)
@@ -346,7 +343,8 @@ class _Growth:
         ]
         self.seen.update(tried)
         many = len(tried) > RACED
-        begin = {s: first.beside(s, known, self.alone.get(wider[s])) for s in tried}
+        beside = _each(self.screens, tried, lambda screen, s: screen.beside(s, known, self.alone.get(wider[s])))
+        begin = dict(zip(tried, beside, strict=True))
         glanced = self._glance(known, begin, FIRST_STEPS if many else GLANCING)
         if many:
             going = [list(glanced)[i] for i in _promising(first, [wider[s] for s in glanced])]

@@ -472,14 +472,18 @@ def propose(
     spread: Float[Array, " n"],
     p: Float[Array, " k"],
     delta: Float[Array, "windows n"],
-) -> tuple[Float[Array, " k"], Float[Array, "windows n"]]:
-    """Where a Levenberg-Marquardt step leads from (p, initial states)."""
+) -> tuple[Float[Array, " k"], Float[Array, "windows n"], Scalar]:
+    """Where a Levenberg-Marquardt step leads from (p, initial states), and the cost there were residuals linear."""
     precision, gradient, toward, shift = eliminate(curvature, damping)
     held = jnp.outer(free, free)
     precision = jnp.where(held, precision, jnp.eye(len(free))) + damping * jnp.diag(jnp.diagonal(curvature.hessian))
     move = jnp.linalg.solve(precision, jnp.where(free, gradient, 0.0))
     to, move = stride(p, move, bounded, LONGEST)
-    return to, delta + (shift - toward @ move) * spread
+    states = shift - toward @ move
+    pushed = move @ curvature.hessian @ move + jnp.einsum("wi,wij,wj->", states, curvature.own, states)
+    fall = curvature.gradient @ move + (curvature.own_gradient * states).sum()
+    cost = curvature.cost - fall + 0.5 * pushed + jnp.einsum("wi,wij,j->", states, curvature.cross, move)
+    return to, delta + states * spread, cost
 
 
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)

@@ -42,6 +42,10 @@ RACES = ((3, False, 4), (4, True, 2), (6, True, 2))
 many points go on; one race after the other."""
 SCAN = ((2, False, 2),)
 """The same for a scan beside what is known."""
+LEFT = 2
+"""Of the points that go on from a race, how many times as many are left at least in the midst of it."""
+SAME = 0.05
+"""Apart in no z by more than this, two points of a race are one."""
 LASTING = 8
 """Further steps of those that went on."""
 SHIFTS, HELD, MOVES, BETTER = np.delete(np.arange(-5, 6), 5) / 5, 4, 3, 0.99
@@ -55,6 +59,37 @@ DRAWS, ASIDE = 4, 0.7
 """Points of its prior from which a candidate of several parameters is begun beside the usual ones, and of one."""
 EDGE = 0.02
 """Share of a prior at either end where nothing begins."""
+
+
+@dataclass
+class _March:
+    """Where Levenberg and Marquardt's method stands: the point that is tried next, and the best one so far."""
+
+    tried: tuple[Any, Array]
+    here: tuple[Any, ...] = ()
+    """(p, δ, curvature, residuals)."""
+    damping: float = 1e-3
+    promised: float = np.inf
+    """Cost at the point that is tried next, were residuals linear."""
+    steps: float = 0
+    """Points that were tried; infinitely many where it has ended."""
+
+    @property
+    def cost(self) -> float:
+        return float(self.here[2].cost) if self.here else np.inf
+
+    def stop(self) -> None:
+        """No more steps: the cost does not fall, or is none from the first."""
+        self.steps, self.promised = np.inf, self.cost
+
+
+def _distinct(marches: Sequence[_March]) -> list[tuple[Any, Array]]:
+    """(p, δ) of those that are not where one before them is."""
+    found: list[tuple[Any, Array]] = []
+    for march in marches:
+        if all(np.abs(march.here[0] - p).max() > SAME for p, _ in found):
+            found.append(march.here[:2])
+    return found
 
 
 @dataclass
@@ -143,31 +178,43 @@ class Screen:
         Where the point costs more than `bad`, the first step is θ's alone: a rotor takes from the mass that was fitted
         without it. Returns (p, δ, curvature, residuals).
         """
+        march = _March((np.asarray(p), delta))
+        self._advance(march, candidate, sigma, iterations, iterations, scanned, bad)
+        return march.here or (p, delta, None, None)
+
+    def _advance(
+        self,
+        march: _March,
+        candidate: Candidate,
+        sigma: Array,
+        until: int,
+        iterations: int,
+        scanned: bool,
+        bad: float,
+    ) -> None:
+        """Go on with a fit that may take so many steps until it has taken some of them, or has ended."""
         system = np.arange(self.d + self.slots) < self.d
         free = np.arange(self.d + self.slots) < self.d + self.scene.count(candidate)
         if not scanned:
             for effect, place in self.offsets(candidate):
                 free[place] = [not q.scan for q in self.scene.parameters[effect]]
-        damping = 1e-3
-        here: Any = None
-        tried = (np.asarray(p), delta)
-        for k in range(iterations):
-            there = self.scene.assess(candidate, *tried, sigma)
-            cost = float(there[0].cost)
-            if np.isfinite(cost) and (here is None or cost <= float(here[2].cost)):
-                gain = np.inf if here is None else (float(here[2].cost) - cost) / max(abs(cost), 1e-12)
-                here, damping = (*tried, *there), max(damping / 5, 1e-9)
-                if gain < 1e-4:
-                    break
-            elif here is None:
-                break
+        while march.steps < until:
+            there = self.scene.assess(candidate, *march.tried, sigma)
+            cost, before = float(there[0].cost), march.cost
+            march.steps += 1
+            if np.isfinite(cost) and cost <= before:
+                march.here, march.damping = (*march.tried, *there), max(march.damping / 5, 1e-9)
+                if before - cost < 1e-4 * abs(cost):
+                    march.stop()
+            elif not march.here:
+                march.stop()
             else:
-                damping *= 10
-            if k + 1 < iterations:
-                moving = system if k == 0 and cost > bad else free
-                p, delta = propose(here[2], damping, moving, self.bounded, self.shots.spread, *here[:2])
-                tried = (np.asarray(p), delta)
-        return here if here is not None else (p, delta, None, None)
+                march.damping *= 10
+            if march.steps < iterations:
+                moving = system if march.steps == 1 and cost > bad else free
+                at_work = march.here[2], march.damping, moving, self.bounded, self.shots.spread, *march.here[:2]
+                p, delta, promised = propose(*at_work)
+                march.tried, march.promised = (np.asarray(p), delta), float(np.nan_to_num(promised, nan=np.inf))
 
     def settle(
         self,
@@ -260,17 +307,27 @@ class Screen:
         ends: list[tuple[Any, Array]],
         races: Sequence[tuple[int, bool, int]],
     ) -> Begun | None:
-        """Fit a candidate from several points, of which the best go on."""
+        """Fit a candidate from several points, of which the best go on.
+
+        After each third of a race's steps those half are left behind of which linear residuals promise less.
+
+        Source: Karnin, Koren and Somekh 2013 (sequential halving)
+        """
         weighs = self._weighs(k for k in candidate.effects if k not in known.candidate.effects)
         bad = BAD * known.cost if weighs else np.inf
         likelihood = -np.inf
         for steps, scanned, kept in races:
             steps += FALLING if weighs and len(ends) > kept else 0
-            tried = [self.fit(candidate, p, delta, known.sigma, steps, scanned, bad) for p, delta in ends]
-            best = sorted((end for end in tried if end[2] is not None), key=lambda end: float(end[2].cost))
+            marches = [_March((np.asarray(p), delta)) for p, delta in ends]
+            for third in (1, 2, 3):
+                for march in marches:
+                    self._advance(march, candidate, known.sigma, third * steps // 3, steps, scanned, bad)
+                if third < 3 and third * steps >= 3:
+                    marches = sorted(marches, key=lambda m: m.promised)[: max(len(marches) // 2, LEFT * kept)]
+            best = sorted((march for march in marches if march.here), key=lambda march: march.cost)
             if not best:
                 return None
-            ends, likelihood = [end[:2] for end in best[:kept]], self._profile(best[0][3], known.sigma)
+            ends, likelihood = _distinct(best)[:kept], self._profile(best[0].here[3], known.sigma)
         return Begun(candidate, ends, likelihood)
 
     def _weighs(self, effects: Iterable[int]) -> bool:

@@ -295,6 +295,13 @@ class ForceEffect(Effect, Protocol):
         """The force during the time step, N or N m, and the memory for the next one."""
         ...
 
+    def slopes(self, values: Values, moment: Moment) -> Array | None:
+        """The force's derivatives along all numbers, where an effect without memory has so many that these are cheaper.
+
+        None for those that JAX finds.
+        """
+        return None
+
 
 @runtime_checkable
 class SenseEffect(Effect, Protocol):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bayessim_jax.diagnosis.flexible import FLEXIBLE, FlexibleForce
+from bayessim_jax.diagnosis.flexible import FEATURES, FLEXIBLE, FlexibleForce
 from bayessim_jax.diagnosis.forcing import Joint, Passed, commands_of, force_of, pass_on, restore_readings
 from bayessim_jax.diagnosis.response import (
     Beside,
@@ -225,6 +225,9 @@ class Lingering(FlexibleForce):
         now = super().force(values, (), moment)[0]
         return 0.5 * (now + memory), now
 
+    def slopes(self, values, moment):
+        return None
+
 
 @pytest.mark.parametrize("effect", [FLEXIBLE, Lingering()])
 def test_slopes_along_many_parameters_are_those_of_differences(effect):
@@ -236,7 +239,7 @@ def test_slopes_along_many_parameters_are_those_of_differences(effect):
     at = lambda x: force_of(effect, names, "", 0.002, 2, x, rates, time, joint, None)  # noqa: E731
     force, slopes = at(x)
     assert force.shape == (1, 20) and slopes.shape == (1, 20, len(parameters))
-    for k in (0, 7, 20, len(parameters) - 1):
+    for k in (0, 7, 20, FEATURES - 1):
         ahead, behind = (at(x + s * rates * (np.arange(x.size) == k))[0] for s in (1e-5, -1e-5))
         np.testing.assert_allclose(slopes[..., k], (ahead - behind) / 2e-5, atol=1e-6)
 
