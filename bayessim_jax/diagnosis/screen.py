@@ -309,9 +309,10 @@ class Screen:
     ) -> Begun | None:
         """Fit a candidate from several points, of which the best go on.
 
-        After each third of a race's steps those half are left behind of which linear residuals promise less.
+        After each third of a race's steps those half are left behind of which linear residuals promise less (sequential
+        halving).
 
-        Source: Karnin, Koren and Somekh 2013 (sequential halving)
+        Source: Karnin, Koren and Somekh 2013
         """
         weighs = self._weighs(k for k in candidate.effects if k not in known.candidate.effects)
         bad = BAD * known.cost if weighs else np.inf
