@@ -229,8 +229,8 @@ class Lingering(FlexibleForce):
         return None
 
 
-@pytest.mark.parametrize("effect", [FLEXIBLE, Lingering()])
-def test_slopes_along_many_parameters_are_those_of_differences(effect):
+@pytest.mark.parametrize(("effect", "last"), [(FLEXIBLE, FEATURES - 1), (Lingering(), -1)])
+def test_slopes_along_many_parameters_are_those_of_differences(effect, last):
     time, joint = along(jnp.linspace(-3.0, 3.0, 40)[None])
     parameters = effect.parameters("joint/a", Scales())
     names, rates = tuple(p.name for p in parameters), 1.0 + np.arange(len(parameters)) / 7.0
@@ -239,9 +239,21 @@ def test_slopes_along_many_parameters_are_those_of_differences(effect):
     at = lambda x: force_of(effect, names, "", 0.002, 2, x, rates, time, joint, None)  # noqa: E731
     force, slopes = at(x)
     assert force.shape == (1, 20) and slopes.shape == (1, 20, len(parameters))
-    for k in (0, 7, 20, FEATURES - 1):
+    for k in (0, 7, 20, last % len(parameters)):
         ahead, behind = (at(x + s * rates * (np.arange(x.size) == k))[0] for s in (1e-5, -1e-5))
         np.testing.assert_allclose(slopes[..., k], (ahead - behind) / 2e-5, atol=1e-6)
+
+
+def test_units_of_a_flexible_force_may_move_too_little_to_have_slopes():
+    time, joint = along(jnp.linspace(-3.0, 3.0, 40)[None])
+    parameters = FLEXIBLE.parameters("joint/a", Scales())
+    low, high = (
+        np.array([0.1] * FEATURES + [getattr(p, side) for p in parameters[FEATURES:]]) for side in ("low", "high")
+    )
+    names, rates = tuple(p.name for p in parameters), np.ones(len(parameters))
+    at = lambda x: force_of(FLEXIBLE, names, "", 0.002, 2, x, rates, time, joint, None)  # noqa: E731
+    np.testing.assert_allclose(at(low)[0], at(high)[0], rtol=1e-6, atol=1e-6)
+    assert (at(low)[1][..., FEATURES:] == 0.0).all()
 
 
 def test_friction_along_a_motion_opposes_it_and_grows_with_its_level():
