@@ -77,7 +77,7 @@ class Plan:
     def start(self) -> online.State:
         """The state of every seed before the first round, with a leading axis over the seeds."""
         one = lambda setup, key: online.init(online.split(key).init, setup)  # noqa: E731
-        states = jax.jit(jax.vmap(one, (None, 0)))(self.setup, self.keys)
+        states = jax.jit(jax.vmap(one, (None, 0)), compiler_options=online.COMPILER_OPTIONS)(self.setup, self.keys)
         # no weak types: what is compiled fits a checkpoint
         return jax.tree.map(lambda leaf: leaf.astype(leaf.dtype), states)
 

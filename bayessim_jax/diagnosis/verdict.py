@@ -117,6 +117,9 @@ class Thresholds:
     which a special case may be worse and be the finding."""
     form: float = 0.001
     """Share of the misfit that a special case may leave and be the finding: the form of laws is no better known."""
+    clearer: float = 0.1
+    """Times the share that the best candidate leaves, where that is more than the form of a law: what leaves no more
+    and scores worse ties with it."""
     least: float = 4.0
     """Nats in all by which a candidate has to be worse to be out of the confusion set."""
     ceiling: float = 0.9
@@ -298,17 +301,29 @@ def contenders(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) ->
 
 
 def _tied(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> list[Entry]:
-    """What predicts as well as the best, which comes first, and special cases of that which leave next to nothing.
+    """What predicts as well as the best, which comes first, or leaves far less of the misfit.
+
+    And special cases of these that leave next to nothing.
 
     What these leave says less of physics than of how a sign is rounded, in the library and in a machine. Where sensors
     are coarse nothing is left of any of them; then they also have to predict held-out windows nearly as well.
     """
     best = entries[0]
     tied = [entry for entry in entries if ties(entry, best, none, thresholds)]
+    tied += [e for e in entries if e not in tied and _is_clearer(e, best, none, thresholds)]
     near = best.score - thresholds.blur * (best.score - none.score)
     simpler = (e for e in entries if e.score >= near and share_left(e.misfit, none.misfit) <= thresholds.form)
     tied += [e for e in simpler if e not in tied and any(has_special_case(other, e) for other in tied)]
     return tied + [e for e in entries if e not in tied and any(_is_same(e, other, none) for other in tied)]
+
+
+def _is_clearer(entry: Entry, best: Entry, none: Entry, thresholds: Thresholds) -> bool:
+    """Whether a candidate leaves far less of the misfit than the best one, which leaves something, with as few effects.
+
+    A score forgives windows in which a candidate fails altogether; where a rival does not fail, they tell against it.
+    """
+    left, its = share_left(best.misfit, none.misfit), share_left(entry.misfit, none.misfit)
+    return len(entry.names) <= len(best.names) and left > thresholds.form and its <= thresholds.clearer * left
 
 
 def _is_same(entry: Entry, other: Entry, none: Entry) -> bool:

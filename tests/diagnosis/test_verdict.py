@@ -48,6 +48,20 @@ def test_one_candidate_that_explains_is_named():
 
 
 @pytest.mark.parametrize(
+    ("best", "rival", "names", "told"),
+    [
+        (0.02, 0.0015, ["b@x"], ["a@x", "b@x"]),
+        (0.02, 0.004, ["b@x"], ["a@x"]),  # not ten times less
+        (0.0008, 0.00001, ["b@x"], ["a@x"]),  # no more than the form of a law
+        (0.02, 0.0015, ["b@x", "c@x"], ["a@x"]),  # more effects
+    ],
+)
+def test_what_scores_worse_and_leaves_far_less_ties(best, rival, names, told):
+    found = verdict(entry(["a@x"], 100.0, best), entry(names, 90.0, rival, seed=1))
+    assert sorted(name for each in found.confusion for name in each.names) == told
+
+
+@pytest.mark.parametrize(
     ("ahead", "other", "left", "names", "gone"),
     [
         (0.2, 0.01, 0.01, ["b@x"], True),
