@@ -23,8 +23,9 @@ from bayessim_jax.report.words import number, plus_minus
 
 __all__ = ["headline", "render"]
 
-BENT = 3.0
-"""Standard deviations by which a parameter differs between simulators, from which it is told."""
+BENT, SLIGHTLY, MUCH = 2.0, 1.0, 0.05
+"""Standard deviations by which a parameter differs between simulators, from which it is told; the same where it
+differs by a share of itself, and that share."""
 
 
 def headline(diagnosis: CaseDiagnosis) -> str:
@@ -228,12 +229,21 @@ def _bent(diagnosis: CaseDiagnosis, table: Mapping[str, Any]) -> list[str]:
     for name, entry in table["parameters"].items():
         before, after = entry["baseline"], entry["augmented"]
         apart = abs(before["mean"] - after["mean"])
-        if apart > BENT * np.hypot(before["sd"], after["sd"]):
+        if _is_bent(before, after):
             off = f"{number(100 * apart / abs(after['mean']), 2)} % " if after["mean"] else ""
             found.append(
                 html.notice(f"Without what was found, {name} came out {off}off: it had taken part of its place.")
             )
     return found
+
+
+def _is_bent(before: Mapping[str, float], after: Mapping[str, float]) -> bool:
+    """Whether a parameter came out otherwise without what was missing, by mean and sd of both.
+
+    Much is told of, too, where a simulator that is wrong knows itself that it does not know: its sd is wide then.
+    """
+    apart, sd = abs(before["mean"] - after["mean"]), np.hypot(before["sd"], after["sd"])
+    return bool(apart > BENT * sd or (apart > SLIGHTLY * sd and apart > MUCH * abs(after["mean"])))
 
 
 def _candidates(diagnosis: CaseDiagnosis) -> tuple[str, str, str]:
