@@ -34,6 +34,7 @@ __all__ = [
     "is_worth",
     "leaves_much",
     "may_be_named",
+    "predicts_more",
     "share_left",
     "ties",
 ]
@@ -184,6 +185,8 @@ class Diagnosis:
     """Of every set in the confusion set."""
     screened: list[tuple[str, float]] = field(default_factory=list)
     """Every candidate and how much it gained on the windows it was fitted to."""
+    beside_a_rest: bool = False
+    """What is named leaves a rest in short pieces, which no candidate explains."""
     taken_back: Entry | None = None
     """An answer that was taken back, since it predicts recordings left out too badly."""
 
@@ -265,7 +268,9 @@ def decide(
         return result
     tied = contenders(entries, none, thresholds)
     tied = [entry for entry in tied if explains(entry, none, thresholds) and is_worth(entry, entries, none, thresholds)]
-    tied = tied or _find_chief(entries, none, thresholds)
+    if not tied:
+        tied = _find_chief(entries, none, thresholds)
+        result.beside_a_rest = bool(tied)
     if not tied:
         return result
     if any(not entry.names for entry in tied):
@@ -369,20 +374,28 @@ def is_outdone(
 
     Beyond what chance makes of it: by two standard errors of the windows' mean squares, in units of `scale`.
     """
-    every = (baseline, answer, flexible)
-    there = np.all([errors.measured.any((1, 2)) for errors in every], axis=0)
-    if there.sum() < 2:
+    squares = _squares((baseline, answer, flexible), scale)
+    if squares.shape[1] < 2:
         return False
+    was, now, best = np.sqrt(squares.mean(1))
+    return _is_sure(squares[1] - squares[2]) and was - now < thresholds.ceiling * (was - best)
 
-    def squares(errors: Errors) -> Float[np.ndarray, " windows"]:
-        counts = errors.measured[there].sum((1, 2))
-        return ((errors.error[there] / scale) ** 2).sum((1, 2)) / counts
 
-    without, named, free = map(squares, every)
-    more = named - free
-    sure = more.mean() > 2.0 * more.std(ddof=1) / np.sqrt(len(more))
-    was, now, best = (np.sqrt(each.mean()) for each in (without, named, free))
-    return bool(sure and was - now < thresholds.ceiling * (was - best))
+def predicts_more(one: Errors, other: Errors, scale: Float[np.ndarray, " obs"]) -> bool:
+    """Whether one errs less than another in most windows, by two standard errors of the log ratio of mean squares."""
+    squares = _squares((one, other), scale)
+    return squares.shape[1] >= 2 and _is_sure(np.log(squares[1] / squares[0]))
+
+
+def _squares(every: Sequence[Errors], scale: Float[np.ndarray, " obs"]) -> Float[np.ndarray, "simulator windows"]:
+    """Mean squares of windows that all of some simulators predict, in units of `scale`."""
+    there = np.all([errors.measured.any((1, 2)) for errors in every], axis=0)
+    return np.array([((e.error[there] / scale) ** 2).sum((1, 2)) / e.measured[there].sum((1, 2)) for e in every])
+
+
+def _is_sure(gains: Float[np.ndarray, " windows"]) -> bool:
+    """Whether their mean is above 0 by two standard errors."""
+    return bool(gains.mean() > 2.0 * gains.std(ddof=1) / np.sqrt(len(gains)))
 
 
 def leaves_much(baseline: float, answer: float, floor: float, thresholds: Thresholds) -> bool:

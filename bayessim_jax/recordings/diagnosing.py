@@ -23,7 +23,15 @@ from bayessim_jax.diagnosis.procedure import Problem, detect, is_mismatch, name_
 from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.diagnosis.screen import Screened
 from bayessim_jax.diagnosis.simulated_scene import SimulatedScene
-from bayessim_jax.diagnosis.verdict import Diagnosis, Entry, Thresholds, falls_short, is_outdone, share_left
+from bayessim_jax.diagnosis.verdict import (
+    Diagnosis,
+    Entry,
+    Thresholds,
+    falls_short,
+    is_outdone,
+    predicts_more,
+    share_left,
+)
 from bayessim_jax.effects import EFFECTS, Scales, commanded_scales, effect_places, open_form, recorded_scales
 from bayessim_jax.inference.replay import Restarted
 from bayessim_jax.inference.scores import Errors, Score, compare, error_spread, score
@@ -307,7 +315,7 @@ def diagnose_case(
     floor = _floor(variance, scale, shots)
     if result.confusion:
         excused = _floor(variance + np.square(_beside(model, shots)), scale, shots)
-        if _is_refuted(judging, excused, scale, thresholds or Thresholds()):
+        if _is_refuted(judging, excused, scale, thresholds or Thresholds(), result.beside_a_rest):
             result.take_back()
     named = result.verdict != "no_mismatch"
     return CaseDiagnosis(
@@ -336,12 +344,19 @@ def diagnose_case(
     )
 
 
-def _is_refuted(judging: Mapping[str, Errors], floor: float, scale: np.ndarray, thresholds: Thresholds) -> bool:
-    """Whether recordings left out contradict an answer."""
+def _is_refuted(
+    judging: Mapping[str, Errors], floor: float, scale: np.ndarray, thresholds: Thresholds, beside_a_rest: bool
+) -> bool:
+    """Whether recordings left out contradict an answer.
+
+    Where it is one `beside_a_rest`, a force without a name must not find that rest to be forces.
+    """
     if falls_short(judging["baseline"], judging["augmented"], scale, floor, thresholds):
         return True
     if "flexible" not in judging:
         return False
+    if beside_a_rest and predicts_more(judging["flexible"], judging["augmented"], scale):
+        return True
     return is_outdone(judging["baseline"], judging["augmented"], judging["flexible"], scale, thresholds)
 
 

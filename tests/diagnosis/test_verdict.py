@@ -15,6 +15,7 @@ from bayessim_jax.diagnosis.verdict import (
     find_shortsighted,
     is_outdone,
     may_be_named,
+    predicts_more,
 )
 from bayessim_jax.diagnosis.whiteness import Misfit
 from bayessim_jax.inference.scores import Errors
@@ -42,7 +43,7 @@ def verdict(*entries, none=None):
 
 def test_one_candidate_that_explains_is_named():
     found = verdict(entry(["a@x"], 100.0, 0.002), entry(["b@x"], 50.0, 0.4, seed=1))
-    assert found.verdict == "explained"
+    assert found.verdict == "explained" and not found.beside_a_rest
     assert found.best.names == ["a@x"]
     assert 0.9 < found.probabilities[0] < 1.0
 
@@ -98,6 +99,23 @@ def test_an_answer_that_a_force_without_a_name_outdoes_is_taken_back(answer, fle
     found = verdict(entry(["a@x"], 100.0, 0.002), entry(["b@x"], 50.0, 0.4, seed=1))
     found.take_back()
     assert found.verdict == "unexplained" and found.best.names == ["a@x"] and found.confusion == []
+
+
+@pytest.mark.parametrize(
+    ("ratios", "wanted"),
+    [
+        ([0.4, 0.5] + [5.0] * 6, True),  # better in most windows, though these are small ones
+        ([0.4, 0.5] * 4, False),
+        ([0.5, 2.0] * 4, False),
+        ([5.0], False),  # one window says nothing
+    ],
+)
+def test_one_predicts_more_that_errs_less_in_most_windows(ratios, wanted):
+    large = np.arange(len(ratios), 0, -1.0)[:, None, None] ** 2
+    one = uniform_errors(0.1, len(ratios))
+    other = Errors(one.error * np.sqrt(ratios)[:, None, None], one.measured)
+    one, other = (Errors(e.error * large, e.measured) for e in (one, other))
+    assert predicts_more(one, other, np.ones(2)) == wanted
 
 
 def uniform_errors(size, windows=8):
@@ -191,7 +209,7 @@ def test_one_effect_by_which_all_but_a_rest_is_foreseen_is_named(share, judged, 
     found = verdict(pair, alone, entry(["c@x"], 60.0, 0.3, seed=1))
     assert found.verdict == wanted
     if wanted == "explained":
-        assert found.best.names == ["a@x"]
+        assert found.best.names == ["a@x"] and found.beside_a_rest
         assert found.probabilities[0] < 0.8, "the rest counts against it"
 
 
