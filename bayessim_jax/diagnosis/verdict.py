@@ -26,6 +26,7 @@ __all__ = [
     "contenders",
     "decide",
     "error_left",
+    "error_of_sum",
     "explains",
     "falls_short",
     "find_shortsighted",
@@ -464,8 +465,14 @@ def ties(entry: Entry, best: Entry, none: Entry, thresholds: Thresholds) -> bool
     Where the best one leaves something, too, small differences say who mimics what is left rather than who is right.
     """
     difference = best.scores - entry.scores
-    error = difference.std(ddof=1) * np.sqrt(len(difference)) if len(difference) > 1 else 0.0
-    return float(difference.sum()) <= max(thresholds.tie * error, _resolution(best, none, thresholds))
+    return float(difference.sum()) <= max(
+        thresholds.tie * error_of_sum(difference), _resolution(best, none, thresholds)
+    )
+
+
+def error_of_sum(values: Float[np.ndarray, " windows"]) -> float:
+    """Standard error of a sum over windows; 0 where there is one."""
+    return float(values.std(ddof=1) * np.sqrt(len(values))) if len(values) > 1 else 0.0
 
 
 def _resolution(best: Entry, none: Entry, thresholds: Thresholds) -> float:

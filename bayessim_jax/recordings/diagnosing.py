@@ -27,6 +27,7 @@ from bayessim_jax.diagnosis.verdict import (
     Diagnosis,
     Entry,
     Thresholds,
+    error_of_sum,
     falls_short,
     is_outdone,
     predicts_more,
@@ -144,7 +145,32 @@ class CaseDiagnosis:
                 for k, name in enumerate(self.model.margins.names)
             },
             "next_experiment": advise(self.result, self.experiment),
+            "screened": [{"effect": name, "gain": gain} for name, gain in result.screened],
+            "finalists": self._finalists(),
         }
+
+    def _finalists(self) -> list[dict[str, Any]]:
+        """What was simulated: scores on windows that fits have not seen, in nats, with standard errors over windows.
+
+        `gain` is over the simulator without effects, `behind` what the first has more.
+        """
+        result, found = self.result, []
+        for entry, left in zip(result.entries, self.shares_left, strict=True):
+            gain, behind = entry.scores - result.baseline.scores, result.entries[0].scores - entry.scores
+            named = [p for other, p in zip(result.confusion, result.probabilities, strict=True) if other is entry]
+            found.append(
+                {
+                    "effects": entry.names,
+                    "gain": float(gain.sum()),
+                    "gain_se": error_of_sum(gain),
+                    "behind": float(behind.sum()),
+                    "behind_se": error_of_sum(behind),
+                    "misfit_left": left,
+                    "error_ahead_left": entry.ahead,
+                    "probability": named[0] if named else None,
+                }
+            )
+        return found
 
     def _effects(self, entry: Entry) -> list[dict[str, Any]]:
         means, sds = moments_of_effects(self.bench, entry)

@@ -108,9 +108,7 @@ def render(diagnosis: CaseDiagnosis, facts: Mapping[str, Any]) -> str:
             html.section("Where it sits", _places(diagnosis), *(html.figure(*each, wide=True) for each in maps))
         )
     if result.entries:
-        body.append(
-            html.section("What was tried", html.figure(*_candidates(diagnosis), wide=True), _entries(diagnosis))
-        )
+        body.append(html.section("What was tried", html.figure(*_candidates(diagnosis), wide=True), _entries(table)))
     if result.names_something and (curves := laws_plot(diagnosis)):
         caption = (
             "The laws that were found, from 5 % to 95 % of what is believed of their numbers, as far as was recorded; "
@@ -252,15 +250,21 @@ def _candidates(diagnosis: CaseDiagnosis) -> tuple[str, str, str]:
     return candidates_plot(diagnosis.result.screened, named), "Gain of every candidate.", caption
 
 
-def _entries(diagnosis: CaseDiagnosis) -> str:
+def _entries(table: Mapping[str, Any]) -> str:
     rows = []
-    base = diagnosis.result.baseline
-    for entry in diagnosis.result.entries:
-        named = "yes" if entry in diagnosis.result.confusion else ""
-        left = share_left(entry.misfit, base.misfit)
-        shares = (f"{number(100 * share, 2)} %" if np.isfinite(share) else "" for share in (left, entry.ahead))
-        rows.append([entry.title, number(entry.score - base.score, 4), *shares, named])
-    return html.table(["finalist", "gain on recordings left out", "misfit left", "error ahead left", "named"], rows)
+    for entry in table["finalists"]:
+        shares = (entry["misfit_left"], entry["error_ahead_left"])
+        rows.append(
+            [
+                " + ".join(entry["effects"]) or "the time step alone",
+                f"{number(entry['gain'], 4)} ± {number(entry['gain_se'], 2)}",
+                f"{number(entry['behind'], 3)} ± {number(entry['behind_se'], 2)}" if entry["behind_se"] else "",
+                *(f"{number(100 * share, 2)} %" if np.isfinite(share) else "" for share in shares),
+                "" if entry["probability"] is None else number(entry["probability"], 2),
+            ]
+        )
+    heads = ["finalist", "gain on recordings left out", "behind the best", "misfit left", "error ahead left", "named"]
+    return html.table(heads, rows)
 
 
 def _residuals(diagnosis: CaseDiagnosis) -> tuple[str, str, str]:

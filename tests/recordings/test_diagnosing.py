@@ -52,6 +52,22 @@ def test_predictions_of_recordings_left_out_get_as_good_as_noise_allows(friction
     assert abs(mass["augmented"]["mean"] - mass["baseline"]["mean"]) > 5 * mass["augmented"]["sd"]
 
 
+def test_every_candidate_is_told_with_its_score(friction):
+    run, table, _ = friction
+    finalists, page = table["finalists"], (run / "report.html").read_text()
+    (named,) = (each for each in finalists if each["probability"] is not None)
+    assert named["effects"] == ["coulomb_friction@joint/hinge"]
+    assert named["probability"] == table["effects"][0]["probability"]
+    assert finalists[0]["behind"] == finalists[0]["behind_se"] == 0.0
+    assert all(each["behind"] >= 0.0 and each["gain_se"] > 0.0 for each in finalists)
+    gains = [each["gain"] for each in finalists]
+    assert gains == sorted(gains, reverse=True)
+    assert finalists[0]["gain"] - named["gain"] == pytest.approx(named["behind"])
+    assert named["misfit_left"] < 0.03
+    assert {name for each in finalists for name in each["effects"]} <= {each["effect"] for each in table["screened"]}
+    assert all(f"<td>{name}" in page for each in finalists for name in each["effects"][:1])
+
+
 def test_the_run_folder_is_complete_and_the_model_has_the_friction(friction):
     run, table, _ = friction
     for name in ("posterior.nc", "report.html", "config.toml", "run.json", "simulators.json"):
