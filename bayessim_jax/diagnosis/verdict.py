@@ -379,24 +379,21 @@ def is_outdone(
     if squares.shape[1] < 2:
         return False
     was, now, best = np.sqrt(squares.mean(1))
-    return _is_sure(squares[1] - squares[2]) and was - now < thresholds.ceiling * (was - best)
+    more = squares[1] - squares[2]
+    return bool(more.sum() > 2.0 * error_of_sum(more) and was - now < thresholds.ceiling * (was - best))
 
 
 def predicts_more(one: Errors, other: Errors, scale: Float[np.ndarray, " obs"]) -> bool:
     """Whether one errs less than another in most windows, by two standard errors of the log ratio of mean squares."""
     squares = _squares((one, other), scale)
-    return squares.shape[1] >= 2 and _is_sure(np.log(squares[1] / squares[0]))
+    more = np.log(squares[1] / squares[0])
+    return len(more) >= 2 and bool(more.sum() > 2.0 * error_of_sum(more))
 
 
 def _squares(every: Sequence[Errors], scale: Float[np.ndarray, " obs"]) -> Float[np.ndarray, "simulator windows"]:
     """Mean squares of windows that all of some simulators predict, in units of `scale`."""
     there = np.all([errors.measured.any((1, 2)) for errors in every], axis=0)
     return np.array([((e.error[there] / scale) ** 2).sum((1, 2)) / e.measured[there].sum((1, 2)) for e in every])
-
-
-def _is_sure(gains: Float[np.ndarray, " windows"]) -> bool:
-    """Whether their mean is above 0 by two standard errors."""
-    return bool(gains.mean() > 2.0 * gains.std(ddof=1) / np.sqrt(len(gains)))
 
 
 def leaves_much(baseline: float, answer: float, floor: float, thresholds: Thresholds) -> bool:

@@ -108,7 +108,8 @@ def render(diagnosis: CaseDiagnosis, facts: Mapping[str, Any]) -> str:
             html.section("Where it sits", _places(diagnosis), *(html.figure(*each, wide=True) for each in maps))
         )
     if result.entries:
-        body.append(html.section("What was tried", html.figure(*_candidates(diagnosis), wide=True), _entries(table)))
+        plot = html.figure(*_candidates(diagnosis), wide=True)
+        body.append(html.section("What was tried", plot, _entries(diagnosis, table)))
     if result.names_something and (curves := laws_plot(diagnosis)):
         caption = (
             "The laws that were found, from 5 % to 95 % of what is believed of their numbers, as far as was recorded; "
@@ -220,28 +221,22 @@ def _replay(diagnosis: CaseDiagnosis) -> str:
 
 
 def _bent(diagnosis: CaseDiagnosis, table: Mapping[str, Any]) -> list[str]:
-    """A warning for every parameter that took the place of what was missing."""
+    """A warning for every parameter that took the place of what was missing.
+
+    Much is told of, too, where a simulator that is wrong knows itself that it does not know: its sd is wide then.
+    """
     if not diagnosis.result.names_something:
         return []
     found = []
     for name, entry in table["parameters"].items():
         before, after = entry["baseline"], entry["augmented"]
-        apart = abs(before["mean"] - after["mean"])
-        if _is_bent(before, after):
+        apart, sd = abs(before["mean"] - after["mean"]), np.hypot(before["sd"], after["sd"])
+        if apart > BENT * sd or (apart > SLIGHTLY * sd and apart > MUCH * abs(after["mean"])):
             off = f"{number(100 * apart / abs(after['mean']), 2)} % " if after["mean"] else ""
             found.append(
                 html.notice(f"Without what was found, {name} came out {off}off: it had taken part of its place.")
             )
     return found
-
-
-def _is_bent(before: Mapping[str, float], after: Mapping[str, float]) -> bool:
-    """Whether a parameter came out otherwise without what was missing, by mean and sd of both.
-
-    Much is told of, too, where a simulator that is wrong knows itself that it does not know: its sd is wide then.
-    """
-    apart, sd = abs(before["mean"] - after["mean"]), np.hypot(before["sd"], after["sd"])
-    return bool(apart > BENT * sd or (apart > SLIGHTLY * sd and apart > MUCH * abs(after["mean"])))
 
 
 def _candidates(diagnosis: CaseDiagnosis) -> tuple[str, str, str]:
@@ -250,13 +245,13 @@ def _candidates(diagnosis: CaseDiagnosis) -> tuple[str, str, str]:
     return candidates_plot(diagnosis.result.screened, named), "Gain of every candidate.", caption
 
 
-def _entries(table: Mapping[str, Any]) -> str:
+def _entries(diagnosis: CaseDiagnosis, table: Mapping[str, Any]) -> str:
     rows = []
-    for entry in table["finalists"]:
+    for title, entry in zip((e.title for e in diagnosis.result.entries), table["finalists"], strict=True):
         shares = (entry["misfit_left"], entry["error_ahead_left"])
         rows.append(
             [
-                " + ".join(entry["effects"]) or "the time step alone",
+                title,
                 f"{number(entry['gain'], 4)} ± {number(entry['gain_se'], 2)}",
                 f"{number(entry['behind'], 3)} ± {number(entry['behind_se'], 2)}" if entry["behind_se"] else "",
                 *(f"{number(100 * share, 2)} %" if np.isfinite(share) else "" for share in shares),
