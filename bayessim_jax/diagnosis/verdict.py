@@ -309,7 +309,7 @@ def contenders(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) ->
 def _tied(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> list[Entry]:
     """What predicts as well as the best, which comes first, or leaves far less of the misfit.
 
-    And special cases of these that leave next to nothing.
+    And special cases of these that leave next to nothing, or hardly more than these where these leave something.
 
     What these leave says less of physics than of how a sign is rounded, in the library and in a machine. Where sensors
     are coarse nothing is left of any of them; then they also have to predict held-out windows nearly as well.
@@ -320,6 +320,7 @@ def _tied(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> list
     near = best.score - thresholds.blur * (best.score - none.score)
     simpler = (e for e in entries if e.score >= near and share_left(e.misfit, none.misfit) <= thresholds.form)
     tied += [e for e in simpler if e not in tied and any(has_special_case(other, e) for other in tied)]
+    tied += [e for e in entries if e not in tied and any(_does_as_well(e, o, none, thresholds) for o in tied)]
     return tied + [e for e in entries if e not in tied and any(_is_same(e, other, none) for other in tied)]
 
 
@@ -330,6 +331,17 @@ def _is_clearer(entry: Entry, best: Entry, none: Entry, thresholds: Thresholds) 
     """
     left, its = share_left(best.misfit, none.misfit), share_left(entry.misfit, none.misfit)
     return len(entry.names) <= len(best.names) and left > thresholds.form and its <= thresholds.clearer * left
+
+
+def _does_as_well(entry: Entry, other: Entry, none: Entry, thresholds: Thresholds) -> bool:
+    """Whether a special case explains the misfit, and a law that has it leaves something and hardly less: not its own.
+
+    What both leave is in neither of them, and says which bends to it. A constraint that brakes a joint within
+    milliseconds, as MuJoCo's `frictionloss` does, is dry friction, and no bristle holds it.
+    """
+    left, its = share_left(other.misfit, none.misfit), share_left(entry.misfit, none.misfit)
+    hardly_less = left > thresholds.form and left > thresholds.worth * its
+    return hardly_less and has_special_case(other, entry) and explains(entry, none, thresholds)
 
 
 def _is_same(entry: Entry, other: Entry, none: Entry) -> bool:

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from bayessim_jax.diagnosis.absorbed import find_absorbed
 from bayessim_jax.diagnosis.belief import moments_of_effects, moments_of_theta
@@ -39,7 +39,7 @@ from bayessim_jax.inference.scores import Errors, Score, compare, error_spread, 
 from bayessim_jax.inference.shooting import Shots
 from bayessim_jax.recordings.experiments import advise, next_experiment
 from bayessim_jax.recordings.identification import channel_scale, start_spread
-from bayessim_jax.recordings.shots import CaseModel, interpolate, split_windows, take
+from bayessim_jax.recordings.shots import CaseModel, interpolate, split_numbers, take
 from bayessim_jax.recordings.stepping import Settled, settle_step
 from bayessim_jax.recordings.windows import Windows, cut_windows
 
@@ -193,10 +193,10 @@ class CaseDiagnosis:
         return found
 
 
-def _thin(windows: Windows, most: int) -> Windows:
-    """At most so many windows, spread evenly."""
-    count = len(windows)
-    return windows if count <= most else take(windows, np.unique(np.linspace(0, count - 1, most).astype(int)))
+def _thin(numbers: Int[np.ndarray, " n"], most: int) -> Int[np.ndarray, " m"]:
+    """At most so many, spread evenly."""
+    count = len(numbers)
+    return numbers if count <= most else numbers[np.unique(np.linspace(0, count - 1, most).astype(int))]
 
 
 @dataclass(frozen=True)
@@ -216,7 +216,9 @@ class _Taken:
 
 def _take_case(key: Array, model: CaseModel, effects: Sequence[Any], say: Callable[[str], None]) -> _Taken:
     """Windows, smoothed motion, every effect at every place, and the fit without effects."""
-    fitted, held = _split(model)
+    every = _every_window(model)
+    fitting, judging = (_thin(n, m) for n, m in zip(split_numbers(model, every), (MOST_FITTED, MOST_HELD), strict=True))
+    fitted, held = take(every, fitting), take(every, judging)
     settled = settle_step(key, model, fitted, say=say)
     model = settled.model
     windows = join(fitted, held)
@@ -233,21 +235,25 @@ def _take_case(key: Array, model: CaseModel, effects: Sequence[Any], say: Callab
         motion=None,
         step=model.step,
     )
-    pieces, problem = (fitted, whole) if isinstance(system, Restarted) else _cut(model, whole, fitted, len(windows))
+    pieces, problem = (
+        (fitted, whole) if isinstance(system, Restarted) else _cut(model, whole, fitted, fitting, len(windows))
+    )
     return _Taken(model, windows, np.arange(len(windows)) < len(fitted), pieces, whole, problem, settled)
 
 
-def _split(model: CaseModel) -> list[Windows]:
-    """Windows that choose and windows that judge."""
+def _every_window(model: CaseModel) -> Windows:
+    """Of all recordings."""
     lead = 0.0 if isinstance(model.system, Restarted) or not model.compiled.nu else LEAD
-    return [_thin(part, most) for part, most in zip(split_windows(model, lead), (MOST_FITTED, MOST_HELD), strict=True)]
+    return model.windows(range(len(model.recordings)), lead=lead)
 
 
-def _cut(model: CaseModel, whole: Problem, fitted: Windows, most: int) -> tuple[Windows, Problem]:
-    """Pieces of windows along their smoothed motion; predictions ahead are of `most` windows, some of them repeated."""
+def _cut(
+    model: CaseModel, whole: Problem, fitted: Windows, fitting: Int[np.ndarray, " windows"], most: int
+) -> tuple[Windows, Problem]:
+    """Pieces of windows along their smoothed motion, and `most` to predict ahead, some of them repeated."""
     rows = max(round(PIECE / model.system.dt), LEAST)
     pieces = cut_windows(fitted, rows)
-    smooth = cut_windows(_split(model.smoothed)[0], rows)
+    smooth = cut_windows(take(_every_window(model.smoothed), fitting), rows)
     # as many windows as are predicted in the end, so that both are one program
     ahead = model.shots(take(fitted, np.resize(np.arange(len(fitted)), most)))
     problem = dataclasses.replace(

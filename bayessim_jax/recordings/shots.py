@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from bayessim_jax.beliefs.margins import Margin, Margins, log_normal, normal, uniform
 from bayessim_jax.contracts import Box
@@ -40,6 +40,7 @@ __all__ = [
     "margin_of",
     "margins_of",
     "predictor",
+    "split_numbers",
     "split_windows",
     "take",
     "tame",
@@ -338,22 +339,27 @@ def predictor(model: CaseModel) -> Replay:
 
 
 def split_windows(model: CaseModel, lead: float = 0.0) -> tuple[Windows, Windows]:
-    """Windows to fit and windows to judge by: of whole recordings left out, or of every fourth window of the one.
+    """Windows to fit and windows to judge by, without the first `lead` seconds of each recording (`find_windows`)."""
+    every = model.windows(range(len(model.recordings)), lead=lead)
+    fitted, held = split_numbers(model, every)
+    return take(every, fitted), take(every, held)
+
+
+def split_numbers(model: CaseModel, every: Windows) -> tuple[Int[np.ndarray, " fitted"], Int[np.ndarray, " held"]]:
+    """Which windows are to fit and which to judge by: of whole recordings left out, or every fourth window of the one.
 
     About a quarter of the recordings is left out, whose commands are like those of the others (`choose_held_out`);
-    those without a window count for neither. The first `lead` seconds of each are left out, where that costs little
-    (`find_windows`).
+    those without a window count for neither. One window alone is for both.
     """
-    every = model.windows(range(len(model.recordings)), lead=lead)
     present = np.unique(every.recording)
     if len(present) > 1:
         chosen = choose_held_out(describe_inputs([model.recordings[i] for i in present]))
         held = np.isin(every.recording, present[chosen])
     elif len(every) < 2:
-        return every, every
+        return np.arange(len(every)), np.arange(len(every))
     else:
         held = choose_held_out(np.zeros((len(every), 0)))
-    return take(every, ~held), take(every, held)
+    return np.flatnonzero(~held), np.flatnonzero(held)
 
 
 def take(windows: Windows, which: Any) -> Windows:

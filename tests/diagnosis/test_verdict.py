@@ -353,6 +353,23 @@ def test_what_tells_a_law_from_its_special_case_is_more_than_their_form(left, sc
     assert (found.verdict, found.best.names) == ("explained", [simpler if told else general])
 
 
+@pytest.mark.parametrize(
+    ("left", "general", "simpler", "told"),
+    [
+        (0.006, 0.004, "coulomb_friction@joint/a", True),
+        (0.012, 0.004, "coulomb_friction@joint/a", False),  # worth its parameters
+        (0.002, 0.0009, "coulomb_friction@joint/a", False),  # no more than the form of a law
+        (0.04, 0.02, "coulomb_friction@joint/a", False),  # the special case does not explain it
+        (0.006, 0.004, "viscous_friction@joint/a", False),
+    ],
+)
+def test_a_law_that_leaves_hardly_less_than_its_special_case_is_not_what_is_there(left, general, simpler, told):
+    """Though held-out scores tell them apart: friction as a constraint brakes within milliseconds, as bristles do."""
+    law = "lugre_friction@joint/a"
+    found = verdict(entry([law], 1000.0, general), entry([simpler], 900.0, left, seed=1))
+    assert (found.verdict, found.best.names) == ("explained", [simpler if told else law])
+
+
 def test_what_the_time_step_does_is_fitted_and_not_named():
     """A pair with a delay shorter than a step is told by the other's name, once; the delay by itself is nothing."""
     late = [entry(["a@x"], 100.0, 0.002), entry(["a@x"], 99.0, 0.002), entry(["b@x"], 99.5, 0.002)]

@@ -9,9 +9,13 @@ import numpy as np
 import pytest
 
 from bayessim_jax.cli.main import main
+from bayessim_jax.recordings.diagnosing import _take_case
+from bayessim_jax.recordings.loading import load_case
 from bayessim_jax.recordings.repaired import load_repaired
+from bayessim_jax.recordings.shots import case_model
 from benchmarks.worlds import make_case
 from tests.browser import CHROMIUM, open_in_chromium
+from tests.recordings.made_up_case import columns, write_case
 
 
 @pytest.fixture(scope="module")
@@ -109,6 +113,25 @@ def test_the_repaired_simulator_is_there_to_train_on(friction):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_windows_have_their_own_motion_also_of_machines_that_nothing_drives(tmp_path, seed):
+    """Which recordings are left out then hangs on where they begin, and smoothing moves what is at rest there."""
+    rng, recordings = np.random.default_rng(seed), {}
+    for k in range(4):
+        data = columns(rows=200)
+        data["actuator/motor/ctrl"] *= 0.0
+        data["joint/hinge/qpos"] = (k + 1.0) * np.cos(3.0 * data["time"])
+        data["joint/hinge/qvel"] = -3.0 * (k + 1.0) * np.sin(3.0 * data["time"])
+        for name in ("joint/hinge/qpos", "joint/hinge/qvel"):
+            data[name] = data[name] + 1e-3 * rng.normal(size=200)
+        recordings[f"run{k}"] = data
+    model = case_model(load_case(write_case(tmp_path / "free", **recordings)).check())
+    taken = _take_case(jax.random.key(0), model, [], lambda text: None)
+    motion, y = taken.problem.motion, np.asarray(taken.problem.shots.y)
+    there = np.asarray(taken.problem.shots.measured)[..., 0]
+    assert np.abs(np.asarray(motion.qpos)[..., 0] - y[..., 0])[there].max() < 0.02
+
+
 def test_a_clean_machine_lacks_nothing(folder):
     make_case(folder / "clean", "slide", seed=12)
     assert main(["diagnose", str(folder / "clean"), "--out", str(folder / "clean-run"), "--quiet"]) == 0
