@@ -38,6 +38,7 @@ from bayessim_jax.diagnosis.verdict import (
     has_special_case,
     is_worth,
     may_be_named,
+    most_left,
     share_left,
 )
 from bayessim_jax.diagnosis.whiteness import FALSE_ALARMS, judge_misfit
@@ -207,12 +208,14 @@ def name_effects(
     *,
     thresholds: Thresholds | None = None,
     say: Callable[[str], None] = lambda text: None,
+    go_on: Callable[[Bench, Entry], bool] = lambda bench, best: True,
 ) -> Diagnosis:
     """Find what a simulator lacks whose misfit was detected.
 
     First every effect at every place along the recorded motion (`diagnosis.screen`), or, in a system without a model,
     simulated from few points; then the best of them are simulated on a bench of their own, pairs where one is not
-    enough, and larger sets where the best pair is worth both of its effects and is not enough either.
+    enough, and larger sets where the best pair is worth both of its effects and is not enough either. `go_on` is asked
+    with the best single effect before that, and may end the search.
     """
     thresholds = thresholds or Thresholds()
     screen, start = problem.every, detected.fit
@@ -230,12 +233,20 @@ def name_effects(
     remain = lambda found: share_left(screen.misfit(key, found), before)  # noqa: E731
     finish = partial(_finish, work, none, remain, ahead=problem.ahead, thresholds=thresholds)
     entries = finish(singles)
+    if entries and not go_on(work.bench, entries[0]):
+        return Diagnosis("unexplained", work.bench, none, entries, screened=listed)
     left = share_left(entries[0].misfit, none.misfit) if entries else 1.0
     explained = bool(entries) and explains(entries[0], none, thresholds)
     # where nothing is predicted ahead, what shows in the windows themselves is all that tells of another effect
     shows = explained and problem.ahead is None and entries[0].misfit.p_value < FALSE_ALARMS
     doubtful = explained and (entries[0].ahead > thresholds.doubtful or _is_cornered(entries[0], screen.d))
-    if left > thresholds.enough or not explained or shows or doubtful or _leave_a_rest(entries, none, thresholds):
+    if (
+        left > thresholds.enough
+        or not explained
+        or shows
+        or doubtful
+        or _leave_a_rest(entries, none, np.asarray(problem.shots.measured), thresholds)
+    ):
         say("one effect is not enough: trying pairs")
         worth = thresholds.worth * remain(ranked[0]) if explained else np.inf
         growth = _Growth(screens, begun)
@@ -266,13 +277,17 @@ def name_effects(
     return decide(work.bench, none, entries, work.group, thresholds, listed)
 
 
-def _leave_a_rest(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:
-    """Whether more shows of what every contender leaves than the form of its law, in pieces or ahead."""
-    return all(
-        entry.misfit.p_value < FALSE_ALARMS
-        and (share_left(entry.misfit, none.misfit) > thresholds.rest or entry.ahead > thresholds.rest_ahead)
-        for entry in contenders(entries, none, thresholds)
-    )
+def _leave_a_rest(
+    entries: Sequence[Entry], none: Entry, measured: Bool[np.ndarray, "windows rows obs"], thresholds: Thresholds
+) -> bool:
+    """Whether more shows of what every contender leaves than its form: in pieces, ahead or in one channel."""
+
+    def leaves(entry: Entry) -> bool:
+        of_all, of_one = share_left(entry.misfit, none.misfit), most_left(entry.misfit, none.misfit, measured)
+        return of_all > thresholds.rest or entry.ahead > thresholds.rest_ahead or of_one > thresholds.apart
+
+    tied = contenders(entries, none, thresholds)
+    return all(entry.misfit.p_value < FALSE_ALARMS and leaves(entry) for entry in tied)
 
 
 def _is_cornered(entry: Entry, d: int) -> bool:

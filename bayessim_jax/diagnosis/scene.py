@@ -366,7 +366,7 @@ class Scene(CandidatesOf):
         return around
 
     def _windowed(self, p: np.ndarray, motion: Motion) -> Windowed:
-        seen, c = _see_all(self.system, self.margins, p[: self.d], motion.qpos, motion.qvel, motion.ctrl)
+        seen, c = _see_all(self.system, self.margins, p[: self.d], motion.qpos, motion.qvel, motion.ctrl, self.step)
         return Windowed(self.shots.y, self.shots.measured, seen, c, self.shots.spread)
 
     @cached_property
@@ -778,7 +778,9 @@ def _distort(
     return Readings(scale, shift, along, first)
 
 
-def _see_one(system: MjcfSystem, theta: Array, qpos: Array, qvel: Array, ctrl: Array) -> tuple[Array, Array]:
+def _see_one(
+    system: MjcfSystem, theta: Array, qpos: Array, qvel: Array, ctrl: Array, step: float
+) -> tuple[Array, Array]:
     model = system.engine.model
     nv = model.nv
 
@@ -786,15 +788,22 @@ def _see_one(system: MjcfSystem, theta: Array, qpos: Array, qvel: Array, ctrl: A
         state = system.begin(theta, displace(model, qpos, move[:nv]), qvel + move[nv:])
         return system.observe(theta, dataclasses.replace(state, ctrl=ctrl))
 
-    zero = jnp.zeros(2 * nv)
-    return see(zero), jax.vmap(lambda d: jax.jvp(see, (zero,), (d,))[1], out_axes=-1)(jnp.eye(2 * nv))
+    zero, every = jnp.zeros(2 * nv), jnp.eye(2 * nv)
+    if step:
+        slopes = jax.vmap(lambda d: (see(step * d) - see(-step * d)) / (2.0 * step), out_axes=-1)(every)
+    else:
+        slopes = jax.vmap(lambda d: jax.jvp(see, (zero,), (d,))[1], out_axes=-1)(every)
+    return see(zero), slopes
 
 
-@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
+@partial(jax.jit, static_argnames="step", compiler_options=COMPILER_OPTIONS)
 def _see_all(
-    system: MjcfSystem, margins: Margins, z: Array, qpos: Array, qvel: Array, ctrl: Array
+    system: MjcfSystem, margins: Margins, z: Array, qpos: Array, qvel: Array, ctrl: Array, step: float
 ) -> tuple[Array, Array]:
-    """What the sensors show along a motion, and its derivatives along the state; the last command stays."""
+    """What the sensors show along a motion, and its derivatives along the state; the last command stays.
+
+    Derivatives are differences of two steps' length where there is a `step`.
+    """
     theta, held = margins.theta(z), jnp.concatenate([ctrl, ctrl[:, -1:]], 1)
-    one = lambda q, v, u: _see_one(system, theta, q, v, u)  # noqa: E731
+    one = lambda q, v, u: _see_one(system, theta, q, v, u, step)  # noqa: E731
     return jax.vmap(jax.vmap(one))(qpos, qvel, held)

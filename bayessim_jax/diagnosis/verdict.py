@@ -34,6 +34,7 @@ __all__ = [
     "is_outdone",
     "is_worth",
     "leaves_much",
+    "most_left",
     "may_be_named",
     "predicts_more",
     "share_left",
@@ -59,10 +60,12 @@ TWINS = {
     "lugre_friction": ("hysteresis",),
     "hysteresis": ("lugre_friction",),
     "sensor_offset": ("link_offset", "base_tilt"),
-    "link_offset": ("sensor_offset", "base_tilt"),
+    "link_offset": ("sensor_offset", "base_tilt", "payload"),
+    "payload": ("link_offset",),
     "base_tilt": ("sensor_offset", "link_offset"),
 }
-"""Effects that look the same at one joint: brakes, what bends before it yields, and what turns the zero of an angle.
+"""Effects that look the same at one joint: brakes, what bends before it yields, what turns the zero of an angle, and
+what moves a centre of mass where the mass is unknown.
 
 Where one is found, the others are tried.
 """
@@ -104,6 +107,8 @@ class Thresholds:
     """The same for one effect, where what it leaves shows."""
     rest_ahead: float = 0.02
     """Share of the error of predictions ahead, above which pairs are tried, too, where what is left shows."""
+    apart: float = 0.05
+    """The same for the share that is left of one channel's misfit: another joint's, which is hardly moved."""
     doubtful: float = 0.1
     """Share of the error of predictions ahead, above which they are tried, too."""
     lacking: float = 0.05
@@ -209,9 +214,21 @@ class Diagnosis:
 
 def share_left(after: Misfit, before: Misfit) -> float:
     """Share of a misfit that a candidate leaves in the windows judged, both in units of the smaller noise."""
-    noise, judged = np.minimum(after.noise, before.noise), after.judged & before.judged
-    own, was = ((m.excess * (m.noise / noise) ** 2)[judged].sum() for m in (after, before))
+    own, was = (power.sum() for power in _powers(after, before))
     return float(max(own, 0.0) / max(was, 1e-12))
+
+
+def most_left(after: Misfit, before: Misfit, measured: Bool[np.ndarray, "windows rows obs"]) -> float:
+    """The same of the channel of which it leaves most, among those with as much misfit as noise before."""
+    own, was = _powers(after, before)
+    there = was > np.maximum(measured[after.judged & before.judged].sum((0, 1)), 1)
+    return float((np.maximum(own, 0.0)[there] / was[there]).max()) if there.any() else 0.0
+
+
+def _powers(after: Misfit, before: Misfit) -> tuple[Float[np.ndarray, " obs"], Float[np.ndarray, " obs"]]:
+    noise, judged = np.minimum(after.noise, before.noise), after.judged & before.judged
+    own, was = ((m.excess * (m.noise / noise) ** 2)[judged].sum(0) for m in (after, before))
+    return own, was
 
 
 def error_left(

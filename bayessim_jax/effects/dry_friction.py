@@ -13,17 +13,19 @@ from bayessim_jax.effects.places import joints
 
 __all__ = ["DryFriction"]
 
-ONSET = "onset"
+ONSET, HOLD = "onset", "hold"
 
 
 class DryFriction(OpenForm, ForceEffect):
     """τ = −F s(v/v₀), s the sign, of a law that is `rounded` a straight line below its onset v₀, in rad/s or m/s.
 
     Machines are not as sharp as a sign: lubricants, bearings in series and the models of others let friction rise over
-    a range of speeds. Recordings tell that range from a law that falls or bends, such as Stribeck's, only where it may
-    be one. With v' the velocity at the end of the time step, m (v' − v)/h = m a − F s(v'/v₀) has the solution
+    a range of speeds, in which a joint creeps, or comes to rest in a while and is held there. Recordings tell that
+    range from a law that falls or bends, such as Stribeck's, only where it may be one. A share α, `hold`, of what moves
+    the joint is withstood at any speed below the onset, about: m is underestimated. With v' the velocity at the end of
+    the time step, m (v' − v)/h = m a − clip(α m a + F v'/v₀, −F, F) has the solution
 
-        τ = −clip(m (v/h + a) F/(F + m v₀/h), −F, F),
+        τ = −clip(ρ m (v/h + a) + (1 − ρ) α m a, −F, F),    ρ = F/(F + m v₀/h),
 
     which stops the joint and holds it for v₀ → 0.
     """
@@ -39,19 +41,23 @@ class DryFriction(OpenForm, ForceEffect):
         """The parameters of F."""
 
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
-        """Those of F, and the onset v₀ where that is free."""
-        return (*self.levels(place, scales), *((_onset(scales),) if self.rounded else ()))
+        """Those of F, and the onset v₀ and what is held below it where these are free."""
+        return (*self.levels(place, scales), *(_form(scales) if self.rounded else ()))
 
     def resist(self, values: Values, moment: Moment, positive: Number, negative: Number) -> Number:
         """The force of the levels against motion in the positive and in the negative direction."""
         stop = moment.stop
         if self.rounded:
             level = jnp.where(jnp.asarray(stop) > 0.0, positive, negative)
-            stop = stop * level / (level + moment.inertia * values[ONSET] / moment.h)
+            sharp = level / (level + moment.inertia * values[ONSET] / moment.h)
+            stop = sharp * stop + (1.0 - sharp) * values[HOLD] * moment.inertia * moment.acceleration
         return -jnp.clip(stop, -negative, positive)
 
 
-def _onset(scales: Scales) -> EffectParameter:
-    """Some hundredths of the joint's speed at most: beyond that friction is viscous, not dry."""
+def _form(scales: Scales) -> tuple[EffectParameter, EffectParameter]:
+    """The onset is some hundredths of the joint's speed at most: beyond that friction is viscous, not dry."""
     speed = scales.speed
-    return EffectParameter(ONSET, f"{scales.unit}/s", 1e-4 * speed, 0.1 * speed, 0.0, 0.01 * speed, log=True, form=0.5)
+    return (
+        EffectParameter(ONSET, f"{scales.unit}/s", 1e-4 * speed, 0.1 * speed, 0.0, 0.01 * speed, log=True, form=0.5),
+        EffectParameter(HOLD, "", 0.0, 1.0, 0.0, 0.5, form=0.5),
+    )

@@ -18,7 +18,8 @@ class OpenForm:
 def open_form(effect: Any) -> Any:
     """The effect with parameters for what its form leaves open; others as they are.
 
-    These are the `onset` of dry friction, below which its sign is rounded; the `taper` of an event, the share of a push
-    in which it rises and falls; `stiffness` and `damping` of the teeth between which there is backlash.
+    These are the `onset` of dry friction, below which its sign is rounded, and the share that it may `hold` there; the
+    `taper` of an event, the share of a push in which it rises and falls; `stiffness` and `damping` of the teeth between
+    which there is backlash.
     """
     return type(effect)(rounded=True) if isinstance(effect, OpenForm) else effect

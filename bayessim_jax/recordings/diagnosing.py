@@ -40,7 +40,7 @@ from bayessim_jax.inference.shooting import Shots
 from bayessim_jax.recordings.experiments import advise, next_experiment
 from bayessim_jax.recordings.identification import channel_scale, start_spread
 from bayessim_jax.recordings.shots import CaseModel, interpolate, split_numbers, take
-from bayessim_jax.recordings.stepping import Settled, settle_step
+from bayessim_jax.recordings.stepping import RATIO, Settled, settle_step
 from bayessim_jax.recordings.windows import Windows, cut_windows
 
 __all__ = ["CaseDiagnosis", "diagnose_case"]
@@ -51,6 +51,8 @@ SMALLEST = 0.02
 """Share of the misfit below which a place is not listed."""
 LONG = 15
 """Steps of the solver for a force with many weights."""
+RATIOS, SAME_STEP = np.linspace(0.0, 1.0, 5), 0.05
+"""Time steps, of the model's own, that the best candidate is fitted with, and by how much one has to be another."""
 PIECE, LEAST = 0.16, 16
 """s and rows: naming is done with pieces of windows of about this length. Stick-slip makes longer ones chaotic."""
 LEAD = 0.2
@@ -241,6 +243,46 @@ def _take_case(key: Array, model: CaseModel, effects: Sequence[Any], say: Callab
     return _Taken(model, windows, np.arange(len(windows)) < len(fitted), pieces, whole, problem, settled)
 
 
+def _settle_with(taken: _Taken, bench: Bench, best: Entry, thresholds: Thresholds) -> list[_Taken]:
+    """The case with the time step that the best candidate finds, if the simulator without it had found another one.
+
+    Where velocities are not measured a fit takes the time step for what is missing, and what was taken wrongly out of
+    the recordings is missing then, too.
+    """
+    error = taken.model.step_error
+    if error is None or taken.settled.told:
+        return []
+    error = dataclasses.replace(error, z=best.fit.z[: bench.d])
+    began = best.candidate, best.fit.z, best.fit.delta, best.fit.sigma
+
+    def cost(ratio: float) -> float:
+        model = dataclasses.replace(taken.model, step_error=dataclasses.replace(error, ratio=ratio))
+        there = dataclasses.replace(taken.problem, shots=model.shots(taken.pieces)).bench(taken.problem.pairs)
+        return float(there.fit(*began).cost) + 0.5 * RATIO.standard(ratio) ** 2
+
+    costs = np.array([cost(ratio) for ratio in RATIOS])
+    ratio = _lowest(RATIOS, costs)
+    if abs(ratio - error.ratio) < SAME_STEP or cost(error.ratio) - cost(ratio) < thresholds.least:
+        return []
+    model = dataclasses.replace(taken.model, step_error=dataclasses.replace(error, ratio=ratio))
+    fitted, shots = take(taken.windows, taken.chosen), model.shots(taken.pieces)
+    ahead = _ahead(model, fitted, len(taken.windows))
+    whole = dataclasses.replace(taken.whole, shots=model.shots(fitted))
+    problem = dataclasses.replace(taken.problem, shots=shots, ahead=ahead)
+    settled = dataclasses.replace(taken.settled, told=True)
+    return [dataclasses.replace(taken, model=model, whole=whole, problem=problem, settled=settled)]
+
+
+def _lowest(places: Float[np.ndarray, " n"], costs: Float[np.ndarray, " n"]) -> float:
+    """Where a parabola through the lowest of costs at even places, and its neighbours, is lowest; within the places."""
+    k = int(np.clip(np.argmin(costs), 1, len(costs) - 2))
+    below, here, above = costs[k - 1 : k + 2]
+    bend = below - 2.0 * here + above
+    move = 0.5 * (below - above) / bend if bend > 0.0 else np.sign(below - above)
+    step = places[1] - places[0]
+    return float(np.clip(places[k] + step * np.clip(move, -1.0, 1.0), places[0], places[-1]))
+
+
 def _every_window(model: CaseModel) -> Windows:
     """Of all recordings."""
     lead = 0.0 if isinstance(model.system, Restarted) or not model.compiled.nu else LEAD
@@ -254,16 +296,19 @@ def _cut(
     rows = max(round(PIECE / model.system.dt), LEAST)
     pieces = cut_windows(fitted, rows)
     smooth = cut_windows(take(_every_window(model.smoothed), fitting), rows)
-    # as many windows as are predicted in the end, so that both are one program
-    ahead = model.shots(take(fitted, np.resize(np.arange(len(fitted)), most)))
     problem = dataclasses.replace(
         whole,
         shots=model.shots(pieces),
         group=pieces.recording,
         motion=_motion(model, pieces, smooth),
-        ahead=ahead,
+        ahead=_ahead(model, fitted, most),
     )
     return pieces, problem
+
+
+def _ahead(model: CaseModel, fitted: Windows, most: int) -> Shots:
+    """As many windows as are predicted in the end, so that both are one program."""
+    return model.shots(take(fitted, np.resize(np.arange(len(fitted)), most)))
 
 
 def _motion(model: CaseModel, windows: Windows, smooth: Windows) -> Motion:
@@ -317,21 +362,10 @@ def diagnose_case(
     fit_key, key = jax.random.split(key)
     say("fitting the simulator as it is")
     taken = _take_case(fit_key, model, list(EFFECTS.values()) if effects is None else effects, say)
+    say(f"{int(taken.chosen.sum())} windows choose, {int((~taken.chosen).sum())} judge")
+    taken, result, residual = _explain(key, taken, thresholds or Thresholds(), say)
     model, windows, chosen = taken.model, taken.windows, taken.chosen
-    say(f"{int(chosen.sum())} windows choose, {int((~chosen).sum())} judge")
-    plain, none = detect(key, taken.whole, taken.settled.fit.marginal(model.margins.size), taken.settled.error)
-    say(f"no mismatch has p = {none.misfit.p_value:.3f}")
-    residual = None
-    if not is_mismatch(taken.whole, none, thresholds):
-        result = Diagnosis("no_mismatch", plain, none, [])
-    else:
-        with ThreadPoolExecutor(1) as pool:
-            # beside the search for a name, of which it needs nothing
-            fitting = pool.submit(_fit_residual_force, key, taken, none)
-            result = name_effects(key, taken.problem, none, thresholds=thresholds, say=say)
-            say("fitting a residual force without a name")
-            residual = fitting.result()
-    bench, shots = result.bench, model.shots(windows)
+    none, bench, shots = result.baseline, result.bench, model.shots(windows)
     scale = channel_scale(shots)
     entries = {"baseline": result.baseline, "augmented": result.best}
     predictions = {which: bench.replay(entry.candidate, entry.fit.z, shots) for which, entry in entries.items()}
@@ -374,6 +408,34 @@ def diagnose_case(
         experiment=next_experiment(model, bench, result, shots),
         absorbed=_absorbed(taken.problem, none),
     )
+
+
+def _explain(
+    key: Array, taken: _Taken, thresholds: Thresholds, say: Callable[[str], None]
+) -> tuple[_Taken, Diagnosis, _Residual | None]:
+    """Detect a mismatch, name what is missing, and fit a force without a name beside that.
+
+    Once more, where what is missing had been taken for the time step: returns the case with the one that was found.
+    """
+    start = taken.settled.fit.marginal(taken.model.margins.size)
+    plain, none = detect(key, taken.whole, start, taken.settled.error)
+    say(f"no mismatch has p = {none.misfit.p_value:.3f}")
+    if not is_mismatch(taken.whole, none, thresholds):
+        return taken, Diagnosis("no_mismatch", plain, none, []), None
+    again: list[_Taken] = []
+
+    def go_on(bench: Bench, best: Entry) -> bool:
+        again.extend(_settle_with(taken, bench, best, thresholds))
+        return not again
+
+    with ThreadPoolExecutor(1) as pool:
+        # beside the search for a name, of which it needs nothing
+        fitting = pool.submit(_fit_residual_force, key, taken, none)
+        result = name_effects(key, taken.problem, none, thresholds=thresholds, say=say, go_on=go_on)
+        if not again:
+            say("fitting a residual force without a name")
+            return taken, result, fitting.result()
+    return _explain(key, again[0], thresholds, say)
 
 
 def _is_refuted(

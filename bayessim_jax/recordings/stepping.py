@@ -95,6 +95,8 @@ class Settled:
     """The case's, and that of s."""
     error: Float[np.ndarray, "windows rows obs"]
     """What is uncertain of the time step's effect on predictions, a standard deviation in the channels' units."""
+    told: bool = True
+    """Whether positions and velocities tell s, or it does not matter; else the fit does, which takes it for physics."""
 
 
 def settle_step(
@@ -139,7 +141,8 @@ def settle_step(
         ahead, behind = (interpolate(error.nodes, ratio + step, calm) for step in (1e-3, -1e-3))
         wild = (calm == 0.0).all(1) * np.abs(runs).max(1)
         base = dataclasses.replace(base, step_error=dataclasses.replace(error, z=found.z[:-1], ratio=ratio))
-        return Settled(base, found, predict, seen, margins, max(sd, SURE) * (ahead - behind) / 2e-3 + wild)
+        uncertain = max(sd, SURE) * (ahead - behind) / 2e-3 + wild
+        return Settled(base, found, predict, seen, margins, uncertain, told=moved[1] < RATIO.b)
 
     if size > TOLERABLE and not model.step:
         finest = case_model(model.case, engine=model.engine_name, before=model.before, refined=REFINED**2)

@@ -101,17 +101,50 @@ def test_a_rounded_sign_lets_a_joint_creep_below_its_onset_and_no_further(name, 
     """Pushed with half the level it moves at half the onset; pushed with more than the level, as with a sharp sign."""
     rounded = open_form(EFFECTS[name])
     base = system(cart(0.002, "0 0 -9.81"), "cart")
-    creeping = run(base, [(rounded, RAIL)], [*values, onset], push(1.5, 600), 0.0, 0.0, MASS)
+    creeping = run(base, [(rounded, RAIL)], [*values, onset, 0.0], push(1.5, 600), 0.0, 0.0, MASS)
     assert float(creeping[-1, 1]) == pytest.approx(0.5 * onset, rel=1e-3, abs=1e-8)
-    sliding = run(base, [(rounded, RAIL)], [*values, onset], push(3.5, 600), 0.0, 0.0, MASS)
+    sliding = run(base, [(rounded, RAIL)], [*values, onset, 0.0], push(3.5, 600), 0.0, 0.0, MASS)
     assert float(sliding[-1, 1] - sliding[-101, 1]) == pytest.approx((3.5 - 3.0) / MASS, rel=1e-3)
+
+
+def test_what_moves_a_joint_below_the_onset_is_held_in_part():
+    """Pushed with half the level it creeps at half the onset, at less, or not at all, and comes to that slowly."""
+    base, rounded = system(cart(0.002, "0 0 -9.81"), "cart"), open_form(EFFECTS["coulomb_friction"])
+    creep = []
+    for hold in (0.0, 0.5, 1.0):
+        seen = np.asarray(run(base, [(rounded, RAIL)], [3.0, 0.2, hold], push(1.5, 600), 0.0, 0.15, MASS))[:, 1]
+        assert np.all(np.diff(seen) < 1e-9) and seen[10] > 0.1 * (0.15 - seen[-1]) + seen[-1]
+        creep.append(seen[-1])
+    assert creep[0] == pytest.approx(0.1, rel=1e-3) and 0.04 < creep[1] < 0.07
+    assert creep[2] == pytest.approx(0.0, abs=1e-5)
+
+
+def test_friction_that_holds_is_what_mujoco_makes_of_frictionloss():
+    """Where its constraint does not slip, a = (1 − d) a₀ − d b v; impedance d = 0.9 and b = 2/(0.95 · 0.02 s)."""
+    xml, actions = cart(0.0005, "0 0 -9.81"), 4.0 * np.sin(0.01 * 2.0 * np.pi * np.arange(300))[:, None]
+    model = mujoco.MjModel.from_xml_string(xml)
+    model.dof_frictionloss[0], data, wanted = 3.0, mujoco.MjData(model), []
+    for (force,) in actions:
+        data.ctrl[0] = force
+        mujoco.mj_step(model, data, 20)
+        wanted.append(data.qvel[0])
+    base, rounded = system(xml, "cart"), open_form(EFFECTS["coulomb_friction"])
+    ride = simulate(with_effects(base, [(rounded, RAIL)], Scales()), actions, 0.0, 0.0)
+
+    def error(hold):
+        onsets = 3.0 / (MASS * 0.9 * 105.3) * np.array([0.1, 0.5, 0.7, 1.0, 1.4, 2.0])
+        return min(np.abs(ride(jnp.array([MASS, 3.0, v, hold]))[:, 1] - np.array(wanted)).max() for v in onsets)
+
+    holding, creeping = min(map(error, (0.85, 0.9, 0.93, 0.96))), error(0.0)
+    assert holding < 0.01 * np.abs(wanted).max()
+    assert holding < 0.3 * creeping
 
 
 @pytest.mark.parametrize(("onset", "counts"), [(0.02, 0.02), (0.05, 0.05), (0.2, 0.05)])
 def test_a_sign_is_not_rounded_beyond_half_of_the_speed_at_which_friction_falls(onset, counts):
     """Or a fall within the onset would be another form of the sign of friction that does not fall."""
     base, rounded = system(cart(0.002, "0 0 -9.81"), "cart"), open_form(EFFECTS["stribeck_friction"])
-    creeping = run(base, [(rounded, RAIL)], [3.0, 3.0, 0.1, onset], push(1.5, 600), 0.0, 0.0, MASS)
+    creeping = run(base, [(rounded, RAIL)], [3.0, 3.0, 0.1, onset, 0.0], push(1.5, 600), 0.0, 0.0, MASS)
     assert float(creeping[-1, 1]) == pytest.approx(0.5 * counts, rel=1e-3)
 
 
@@ -119,7 +152,7 @@ def test_a_form_is_open_only_in_what_asks_for_it():
     place, scales = "joint/hinge", Scales()
     assert [p.name for p in EFFECTS["coulomb_friction"].parameters(place, scales)] == ["coulomb"]
     rounded = open_form(EFFECTS["coulomb_friction"])
-    assert [p.name for p in rounded.parameters(place, scales)] == ["coulomb", "onset"]
+    assert [p.name for p in rounded.parameters(place, scales)] == ["coulomb", "onset", "hold"]
     assert open_form(EFFECTS["viscous_friction"]) is EFFECTS["viscous_friction"]
 
 

@@ -104,7 +104,7 @@ def test_the_repaired_simulator_is_there_to_train_on(friction):
     repaired = load_repaired(run)
     assert (repaired.verdict, repaired.effects) == ("explained", ("coulomb_friction@joint/hinge",))
     own = table["effects"][0]["parameters"]
-    found = [table["parameters"]["rod_mass"]["augmented"], own["coulomb"], own["onset"]]
+    found = [table["parameters"]["rod_mass"]["augmented"], own["coulomb"], own["onset"], own["hold"]]
     np.testing.assert_allclose(repaired.mean, [p["mean"] for p in found], rtol=1e-6)
     np.testing.assert_allclose(repaired.sd, [p["sd"] for p in found], rtol=1e-6)
     settings = json.loads((run / "simulators.json").read_text())
@@ -112,7 +112,6 @@ def test_the_repaired_simulator_is_there_to_train_on(friction):
     assert (repaired.noise > 0).all() and (repaired.noise <= 1.2 * np.array(baseline)).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_windows_have_their_own_motion_also_of_machines_that_nothing_drives(tmp_path, seed):
     """Which recordings are left out then hangs on where they begin, and smoothing moves what is at rest there."""
@@ -132,6 +131,7 @@ def test_windows_have_their_own_motion_also_of_machines_that_nothing_drives(tmp_
     assert np.abs(np.asarray(motion.qpos)[..., 0] - y[..., 0])[there].max() < 0.02
 
 
+@pytest.mark.slow
 def test_a_clean_machine_lacks_nothing(folder):
     make_case(folder / "clean", "slide", seed=12)
     assert main(["diagnose", str(folder / "clean"), "--out", str(folder / "clean-run"), "--quiet"]) == 0
