@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from bayessim_jax.beliefs.margins import Margins, uniform
 from bayessim_jax.diagnosis.flexible import FEATURES, FLEXIBLE, FlexibleForce
 from bayessim_jax.diagnosis.forcing import Joint, Passed, commands_of, force_of, pass_on, restore_readings
 from bayessim_jax.diagnosis.response import (
@@ -24,6 +25,7 @@ from bayessim_jax.diagnosis.response import (
     separate,
     weigh,
 )
+from bayessim_jax.diagnosis.scene import _see_all
 from bayessim_jax.effects import EFFECTS, Moment, Scales
 from bayessim_jax.systems.mjcf import Unknown, displace, mjcf_system
 
@@ -332,3 +334,25 @@ def test_a_memory_that_only_one_candidate_has_is_integrated_out():
         profiled[w] = -0.5 * left @ left
     np.testing.assert_allclose(scores(False), memory, rtol=1e-5)
     np.testing.assert_allclose(scores(True), profiled, rtol=1e-5)
+
+
+def test_what_sensors_show_beside_a_motion_is_differenced_where_an_engine_has_no_derivatives():
+    """MuJoCo's C engine, of models with contacts, against the one that is written out."""
+    xml = """<mujoco><worldbody><body name="rod"><joint name="hinge" type="hinge" axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass="0.6"/></body></worldbody>
+      <actuator><motor name="motor" joint="hinge"/></actuator>
+      <sensor><jointpos name="angle" joint="hinge"/><jointvel name="speed" joint="hinge"/></sensor></mujoco>"""
+    unknown, channels = (
+        Unknown("mass", ("body/rod/mass",), 0.3, 1.2),
+        ["sensor/angle", "sensor/speed", "joint/hinge/qvel"],
+    )
+    q, v = np.random.default_rng(0).normal(size=(2, 2, 5, 1))
+    found = []
+    for engine, step in (("tree", 0.0), ("mujoco", 1e-3)):
+        system = mjcf_system(xml, [unknown], observe=channels, engine=engine)
+        margins = Margins.create(["mass"], [uniform(0.3, 1.2)])
+        found.append(_see_all(system, margins, jnp.zeros(1), q, v, np.zeros((2, 4, 1)), step))
+    (seen, slopes), (its_seen, its_slopes) = found
+    assert slopes.shape == (2, 5, 3, 2)
+    np.testing.assert_allclose(seen, its_seen, atol=1e-6)
+    np.testing.assert_allclose(slopes, its_slopes, atol=1e-4)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bayessim_jax.cli.main import main
-from bayessim_jax.recordings.diagnosing import _take_case
+from bayessim_jax.recordings.diagnosing import _lowest, _take_case
 from bayessim_jax.recordings.loading import load_case
 from bayessim_jax.recordings.repaired import load_repaired
 from bayessim_jax.recordings.shots import case_model
@@ -129,6 +129,13 @@ def test_windows_have_their_own_motion_also_of_machines_that_nothing_drives(tmp_
     motion, y = taken.problem.motion, np.asarray(taken.problem.shots.y)
     there = np.asarray(taken.problem.shots.measured)[..., 0]
     assert np.abs(np.asarray(motion.qpos)[..., 0] - y[..., 0])[there].max() < 0.02
+
+
+@pytest.mark.parametrize(("at", "bend"), [(0.4, 3.0), (0.05, 3.0), (0.97, 3.0), (-0.3, 3.0), (1.4, 3.0), (0.2, -3.0)])
+def test_the_lowest_place_of_a_parabola_is_found_within_the_places(at, bend):
+    places = np.linspace(0.0, 1.0, 5)
+    wanted = np.clip(at, 0.0, 1.0) if bend > 0.0 else 1.0
+    assert _lowest(places, bend * (places - at) ** 2) == pytest.approx(wanted, abs=0.26 if bend < 0.0 else 1e-9)
 
 
 @pytest.mark.slow

@@ -85,10 +85,12 @@ class Gap:
         return 0.0, force
 
 
-def write_world(folder, law=None, motor=None, seed=0):
+def write_world(folder, law=None, motor=None, seed=0, frictionloss=0.0, damping=0.0, velocities=True):
     """Six recordings of sines and steps, with noise of 1 mrad and 10 mrad/s."""
     rng = np.random.default_rng(seed)
     model = mujoco.MjModel.from_xml_string(MODEL)
+    model.dof_frictionloss[0] = frictionloss
+    model.dof_damping[0] += damping
     model.opt.timestep = STEP
     model.body_mass[1] *= 1.2
     model.body_inertia[1] *= 1.2
@@ -114,6 +116,8 @@ def write_world(folder, law=None, motor=None, seed=0):
         q, v = np.array(rows).T
         seen = [time, q + 1e-3 * rng.normal(size=len(q)), v + 1e-2 * rng.normal(size=len(v)), ctrl]
         recordings[f"run{k + 1}"] = dict(zip(COLUMNS, seen, strict=True))
+        if not velocities:
+            del recordings[f"run{k + 1}"]["joint/hinge/qvel"]
     return write_case(folder, HEAVIER, MODEL, **recordings)
 
 
@@ -143,3 +147,22 @@ def test_textbook_laws_get_their_names(tmp_path, law, motor, wanted):
     mass = table["parameters"]["rod_mass"]["augmented"]
     assert mass["mean"] == pytest.approx(0.72, rel=0.02)
     assert table["fit"]["augmented"]["nrmse"] < 3.0 * table["fit"]["noise_floor"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("world", "wanted", "parameter", "level"),
+    [
+        ({"frictionloss": 0.25}, "coulomb_friction", "coulomb", 0.25),
+        ({"frictionloss": 0.25, "velocities": False}, "coulomb_friction", "coulomb", 0.25),
+        ({"damping": 0.1, "velocities": False}, "viscous_friction", "viscous", 0.1),
+    ],
+)
+def test_what_the_model_itself_can_say_gets_its_name_and_number(tmp_path, world, wanted, parameter, level):
+    """MuJoCo's own friction is a constraint; without velocities, damping and the time step look alike."""
+    model = case_model(load_case(write_world(tmp_path / "plain", **world)).check(), before=BEFORE)
+    table = diagnose_case(jax.random.key(0), model).table()
+    assert table["verdict"] == "explained"
+    (found,) = table["effects"]
+    assert (found["effect"], found["at"]) == (wanted, "joint/hinge")
+    assert found["parameters"][parameter]["mean"] == pytest.approx(level, rel=0.03)
