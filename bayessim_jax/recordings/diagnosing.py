@@ -243,7 +243,7 @@ def _take_case(key: Array, model: CaseModel, effects: Sequence[Any], say: Callab
     return _Taken(model, windows, np.arange(len(windows)) < len(fitted), pieces, whole, problem, settled)
 
 
-def _settle_with(taken: _Taken, bench: Bench, best: Entry, thresholds: Thresholds) -> list[_Taken]:
+def _settle_with(taken: _Taken, bench: Bench, best: Entry, thresholds: Thresholds) -> _Taken | None:
     """The case with the time step that the best candidate finds, if the simulator without it had found another one.
 
     Where velocities are not measured a fit takes the time step for what is missing, and what was taken wrongly out of
@@ -251,7 +251,7 @@ def _settle_with(taken: _Taken, bench: Bench, best: Entry, thresholds: Threshold
     """
     error = taken.model.step_error
     if error is None or taken.settled.told:
-        return []
+        return None
     error = dataclasses.replace(error, z=best.fit.z[: bench.d])
     began = best.candidate, best.fit.z, best.fit.delta, best.fit.sigma
 
@@ -263,14 +263,14 @@ def _settle_with(taken: _Taken, bench: Bench, best: Entry, thresholds: Threshold
     costs = np.array([cost(ratio) for ratio in RATIOS])
     ratio = _lowest(RATIOS, costs)
     if abs(ratio - error.ratio) < SAME_STEP or cost(error.ratio) - cost(ratio) < thresholds.least:
-        return []
+        return None
     model = dataclasses.replace(taken.model, step_error=dataclasses.replace(error, ratio=ratio))
     fitted, shots = take(taken.windows, taken.chosen), model.shots(taken.pieces)
     ahead = _ahead(model, fitted, len(taken.windows))
     whole = dataclasses.replace(taken.whole, shots=model.shots(fitted))
     problem = dataclasses.replace(taken.problem, shots=shots, ahead=ahead)
     settled = dataclasses.replace(taken.settled, told=True)
-    return [dataclasses.replace(taken, model=model, whole=whole, problem=problem, settled=settled)]
+    return dataclasses.replace(taken, model=model, whole=whole, problem=problem, settled=settled)
 
 
 def _lowest(places: Float[np.ndarray, " n"], costs: Float[np.ndarray, " n"]) -> float:
@@ -307,7 +307,7 @@ def _cut(
 
 
 def _ahead(model: CaseModel, fitted: Windows, most: int) -> Shots:
-    """As many windows as are predicted in the end, so that both are one program."""
+    """Windows to predict ahead, as many as are predicted in the end, so that both are one program."""
     return model.shots(take(fitted, np.resize(np.arange(len(fitted)), most)))
 
 
@@ -425,8 +425,9 @@ def _explain(
     again: list[_Taken] = []
 
     def go_on(bench: Bench, best: Entry) -> bool:
-        again.extend(_settle_with(taken, bench, best, thresholds))
-        return not again
+        found = _settle_with(taken, bench, best, thresholds)
+        again.extend([found] if found else [])
+        return found is None
 
     with ThreadPoolExecutor(1) as pool:
         # beside the search for a name, of which it needs nothing
@@ -435,6 +436,7 @@ def _explain(
         if not again:
             say("fitting a residual force without a name")
             return taken, result, fitting.result()
+    say("the time step of what was recorded is another one, by what was found: once more with it")
     return _explain(key, again[0], thresholds, say)
 
 
