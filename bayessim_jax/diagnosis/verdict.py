@@ -34,8 +34,8 @@ __all__ = [
     "is_outdone",
     "is_worth",
     "leaves_much",
-    "most_left",
     "may_be_named",
+    "most_left",
     "predicts_more",
     "share_left",
     "ties",
@@ -226,6 +226,7 @@ def most_left(after: Misfit, before: Misfit, measured: Bool[np.ndarray, "windows
 
 
 def _powers(after: Misfit, before: Misfit) -> tuple[Float[np.ndarray, " obs"], Float[np.ndarray, " obs"]]:
+    """Of two misfits in every channel, over the windows judged in both, in units of the smaller noise."""
     noise, judged = np.minimum(after.noise, before.noise), after.judged & before.judged
     own, was = ((m.excess * (m.noise / noise) ** 2)[judged].sum(0) for m in (after, before))
     return own, was

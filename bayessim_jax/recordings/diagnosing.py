@@ -360,10 +360,11 @@ def diagnose_case(
     `effects` are those that may be missing, all registered ones if left out.
     """
     fit_key, key = jax.random.split(key)
+    thresholds = thresholds or Thresholds()
     say("fitting the simulator as it is")
     taken = _take_case(fit_key, model, list(EFFECTS.values()) if effects is None else effects, say)
     say(f"{int(taken.chosen.sum())} windows choose, {int((~taken.chosen).sum())} judge")
-    taken, result, residual = _explain(key, taken, thresholds or Thresholds(), say)
+    taken, result, residual = _explain(key, taken, thresholds, say)
     model, windows, chosen = taken.model, taken.windows, taken.chosen
     none, bench, shots = result.baseline, result.bench, model.shots(windows)
     scale = channel_scale(shots)
@@ -381,7 +382,7 @@ def diagnose_case(
     floor = _floor(variance, scale, shots)
     if result.confusion:
         excused = _floor(variance + np.square(_beside(model, shots)), scale, shots)
-        if _is_refuted(judging, excused, scale, thresholds or Thresholds(), result.beside_a_rest):
+        if _is_refuted(judging, excused, scale, thresholds, result.beside_a_rest):
             result.take_back()
     named = result.verdict != "no_mismatch"
     return CaseDiagnosis(
@@ -422,22 +423,22 @@ def _explain(
     say(f"no mismatch has p = {none.misfit.p_value:.3f}")
     if not is_mismatch(taken.whole, none, thresholds):
         return taken, Diagnosis("no_mismatch", plain, none, []), None
-    again: list[_Taken] = []
+    again: _Taken | None = None
 
     def go_on(bench: Bench, best: Entry) -> bool:
-        found = _settle_with(taken, bench, best, thresholds)
-        again.extend([found] if found else [])
-        return found is None
+        nonlocal again
+        again = _settle_with(taken, bench, best, thresholds)
+        return again is None
 
     with ThreadPoolExecutor(1) as pool:
         # beside the search for a name, of which it needs nothing
         fitting = pool.submit(_fit_residual_force, key, taken, none)
         result = name_effects(key, taken.problem, none, thresholds=thresholds, say=say, go_on=go_on)
-        if not again:
+        if again is None:
             say("fitting a residual force without a name")
             return taken, result, fitting.result()
     say("the time step of what was recorded is another one, by what was found: once more with it")
-    return _explain(key, again[0], thresholds, say)
+    return _explain(key, again, thresholds, say)
 
 
 def _is_refuted(

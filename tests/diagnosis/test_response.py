@@ -342,10 +342,8 @@ def test_what_sensors_show_beside_a_motion_is_differenced_where_an_engine_has_no
       <geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass="0.6"/></body></worldbody>
       <actuator><motor name="motor" joint="hinge"/></actuator>
       <sensor><jointpos name="angle" joint="hinge"/><jointvel name="speed" joint="hinge"/></sensor></mujoco>"""
-    unknown, channels = (
-        Unknown("mass", ("body/rod/mass",), 0.3, 1.2),
-        ["sensor/angle", "sensor/speed", "joint/hinge/qvel"],
-    )
+    unknown = Unknown("mass", ("body/rod/mass",), 0.3, 1.2)
+    channels = ["sensor/angle", "sensor/speed", "joint/hinge/qvel"]
     q, v = np.random.default_rng(0).normal(size=(2, 2, 5, 1))
     found = []
     for engine, step in (("tree", 0.0), ("mujoco", 1e-3)):

@@ -135,7 +135,7 @@ def test_windows_have_their_own_motion_also_of_machines_that_nothing_drives(tmp_
 def test_the_lowest_place_of_a_parabola_is_found_within_the_places(at, bend):
     places = np.linspace(0.0, 1.0, 5)
     wanted = np.clip(at, 0.0, 1.0) if bend > 0.0 else 1.0
-    assert _lowest(places, bend * (places - at) ** 2) == pytest.approx(wanted, abs=0.26 if bend < 0.0 else 1e-9)
+    assert _lowest(places, bend * (places - at) ** 2) == pytest.approx(wanted, abs=1e-9)
 
 
 @pytest.mark.slow
