@@ -9,7 +9,7 @@ from pathlib import Path
 from benchmarks.timing import CLOCKS, choose_clock
 
 _MECHANISMS = ("pendulum", "cart-pole", "double pendulum", "3-joint arm", "6-joint arm")
-_RIGS = ("pendulum", "swing", "slide", "sled", "double", "cart", "arm3", "arm6")
+_RIGS = ("pendulum", "swing", "pivot", "slide", "sled", "double", "chain", "servo", "cart", "arm3", "arm6")
 
 
 def main() -> None:

@@ -21,6 +21,7 @@ class Rig:
     parameters: tuple[str, ...]
     """Paths to what is unknown in it."""
     horizon: float = 0.5
+    motions: str = "mixed"
 
 
 def _rig(body: str, actuators: str = "") -> str:
@@ -47,6 +48,25 @@ RIGS = {
         ("body/rod/ipos/2",),
         horizon=1.0,
     ),
+    "pivot": Rig(
+        _rig(
+            '<body name="rod"><joint name="hinge" axis="0 1 0"/>'
+            '<inertial pos="0 0 -0.2" mass="0.3" diaginertia="0.002 0.002 0.0003"/></body>'
+        ),
+        ("body/rod/ipos/2",),
+        horizon=1.0,
+        motions="released",
+    ),
+    "chain": Rig(
+        _rig(
+            '<body name="upper"><joint name="shoulder" axis="0 1 0"/>'
+            '<inertial pos="0 0 -0.12" mass="0.5" diaginertia="0.004 0.004 0.0005"/>'
+            '<body name="lower" pos="0 0 -0.25"><joint name="elbow" axis="0 1 0"/>'
+            '<inertial pos="0 0 -0.1" mass="0.3" diaginertia="0.002 0.002 0.0003"/></body></body>'
+        ),
+        ("body/upper/ipos/2", "body/lower/ipos/2"),
+        motions="released",
+    ),
     "slide": Rig(
         _rig(
             '<body name="carriage"><joint name="rail" type="slide" axis="1 0 0"/>'
@@ -62,6 +82,17 @@ RIGS = {
             '<body name="lower" pos="0 0 -0.3"><joint name="elbow" axis="0 1 0"/>'
             '<inertial pos="0 0 -0.15" mass="0.4" diaginertia="0.003 0.003 0.0003"/></body></body>',
             '<motor name="m1" joint="shoulder" gear="1"/><motor name="m2" joint="elbow" gear="1"/>',
+        ),
+        ("body/upper/mass", "body/lower/mass"),
+    ),
+    "servo": Rig(
+        _rig(
+            '<body name="upper"><joint name="shoulder" axis="0 1 0" damping="0.02"/>'
+            '<inertial pos="0 0 -0.12" mass="0.8" diaginertia="0.006 0.006 0.0005"/>'
+            '<body name="lower" pos="0 0 -0.25"><joint name="elbow" axis="0 1 0" damping="0.01"/>'
+            '<inertial pos="0 0 -0.12" mass="0.4" diaginertia="0.002 0.002 0.0003"/></body></body>',
+            '<position name="s1" joint="shoulder" kp="15" kv="0.6"/>'
+            '<position name="s2" joint="elbow" kp="6" kv="0.2"/>',
         ),
         ("body/upper/mass", "body/lower/mass"),
     ),
@@ -112,7 +143,8 @@ def make_case(
     with tempfile.TemporaryDirectory() as place:
         model = Path(place) / "model.xml"
         model.write_text(about.xml.replace(own, f'timestep="{float(STEP) / finer:.9g}"'), encoding="utf-8")
-        settings = {"parameters": about.parameters, "horizon": about.horizon, "rate": 0.5 / float(STEP)} | settings
-        sealed = conceal(folder, model, effect, **settings)
+        usual: dict[str, Any] = {"parameters": about.parameters, "horizon": about.horizon, "motions": about.motions}
+        usual["rate"] = 0.5 / float(STEP)
+        sealed = conceal(folder, model, effect, **(usual | settings))
     (folder / "model.xml").write_text(about.xml, encoding="utf-8")
     return sealed

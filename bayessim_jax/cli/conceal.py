@@ -36,7 +36,7 @@ class Conceal:
     """Root mean square of the effect's force over that of motors and gravity."""
     parameters: Annotated[tuple[str, ...], tyro.conf.arg(metavar="PATH...")] = ()
     """What is unknown in the model, such as body/arm/mass; the masses of what moves if left out."""
-    motions: Literal["mixed", "sines", "chirp", "steps", "free"] = "mixed"
+    motions: Literal["mixed", "sines", "chirp", "steps", "free", "released"] = "mixed"
     """What the motors do."""
     recordings: int = 6
     """How many."""

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from bayessim_jax.concealment.motions import Motion, draw_motions
+from bayessim_jax.concealment.motions import UNDRIVEN, Motion, draw_motions
 from bayessim_jax.concealment.places import driven_joint, dry_geoms
 from bayessim_jax.concealment.world import RunawayError, build, count_substeps, simulate
 
@@ -79,7 +79,7 @@ def find_drive(model: mujoco.MjModel, kind: str, stride: int) -> Drive:
     back to its home by a weak spring. What comes of it is recorded as the command. Position servos are given positions.
     """
     drive = _guess(model)
-    if not drive.count or kind == "free":
+    if not drive.count or kind in UNDRIVEN:
         return drive
     rows = round(3.0 / (stride * model.opt.timestep))
     for _ in range(TRIALS):

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from bayessim_jax.concealment.bristle import STIFF, draw_rounding, grip
-from bayessim_jax.concealment.law import ForceLaw, Spot
+from bayessim_jax.concealment.law import ForceLaw, ModelLaw, Spot
 from bayessim_jax.concealment.places import driven_joints
 
 if TYPE_CHECKING:
@@ -27,6 +27,8 @@ __all__ = [
 ]
 
 
+BRAKED = 1 / 3
+"""Share of machines whose dry friction is a constraint of MuJoCo's own solver."""
 SHARP = 0.2
 """Of Stribeck's velocity: a sign that is rounded over more of it hides what falls there."""
 
@@ -78,21 +80,39 @@ class DryFriction(ForceLaw):
 
 @dataclass
 class CoulombFriction(DryFriction):
-    """τ = −F_c sign(v), at rest what holds the joint: a stiff bristle that slips at F_c; or −F_c tanh(v/ε)."""
+    """τ = −F_c sign(v): a stiff bristle, which slips at F_c and holds at rest; −F_c tanh(v/ε); or a `Brake`."""
 
     name = "coulomb_friction"
     coulomb: float
     rounding: float = 0.0
 
     @classmethod
-    def make(cls, spot: Spot, amplitude: float, rng: np.random.Generator) -> CoulombFriction:
+    def make(cls, spot: Spot, amplitude: float, rng: np.random.Generator) -> CoulombFriction | Brake:
         """F_c in units of the joint's force."""
         level = amplitude * spot.force
-        return cls(spot, level, draw_rounding(spot, level, rng))
+        rounding = draw_rounding(spot, level, rng)
+        return Brake(spot, level) if rng.uniform() < BRAKED else cls(spot, level, rounding)
 
     def force(self, world: World, q: float, v: float) -> float:
         """The bristles', or that of a rounded sign."""
         return self._grip.pull(v, self.coulomb, self.coulomb)
+
+
+@dataclass
+class Brake(ModelLaw):
+    """Dry friction by a constraint of MuJoCo's solver (`frictionloss`), of which a moving joint feels F_c, too."""
+
+    name = "coulomb_friction"
+    coulomb: float
+
+    @classmethod
+    def make(cls, spot: Spot, amplitude: float, rng: np.random.Generator) -> Brake:
+        """F_c in units of the joint's force."""
+        return cls(spot, amplitude * spot.force)
+
+    def edit(self, model: mujoco.MjModel) -> None:
+        """Added to what the model has."""
+        model.dof_frictionloss[self.spot.v] += self.coulomb
 
 
 @dataclass

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
     from bayessim_jax.concealment.drive import Drive
 
-__all__ = ["KINDS", "Motion", "draw_motions"]
+__all__ = ["KINDS", "UNDRIVEN", "Motion", "draw_motions"]
 
 LEAD = 0.2
-"""s that a machine moves before its recording begins."""
+"""s that a machine moves before its recording begins, unless it is let go then."""
 REST = 0.2
 """The last share of a recording, without motor."""
 
@@ -77,9 +77,11 @@ SIGNALS: dict[str, Callable[[np.random.Generator, np.ndarray], np.ndarray]] = {
     "chirp": _chirp,
     "steps": _steps,
     "free": _free,
+    "released": _free,
 }
 KINDS = ("mixed", *SIGNALS)
-"""What can be asked for; `mixed` takes sines, a chirp and steps in turn."""
+"""What can be asked for; `mixed` takes sines, a chirp and steps in turn. `released` begins at rest, `free` does not."""
+UNDRIVEN = ("free", "released")
 
 
 def draw_motions(
@@ -98,7 +100,7 @@ def draw_motions(
         size = rng.uniform(0.6, 1.1)
         columns = [np.clip(size * SIGNALS[name](rng, time), -1, 1) for _ in range(drive.count)]
         signals = np.stack(columns, 1) if columns else np.zeros((rows, 0))
-        tail = np.arange(rows) >= (0 if name == "free" else (1 - REST) * rows)
+        tail = np.arange(rows) >= (0 if name in UNDRIVEN else (1 - REST) * rows)
         shift = rng.integers(-round(jitter * fine / 2), round(jitter * fine / 2) + 1, rows)
         shift[0] = 0
         motions.append(
@@ -107,9 +109,9 @@ def draw_motions(
                 off=tail[:, None] & drive.frees,
                 qpos=drive.home
                 + drive.scatter * rng.uniform(0.3, 1, len(drive.home)) * rng.choice([-1, 1], len(drive.home)),
-                qvel=drive.swing * rng.uniform(-1, 1, len(drive.swing)),
+                qvel=drive.swing * rng.uniform(-1, 1, len(drive.swing)) * (name != "released"),
                 marks=np.arange(rows) * fine + shift,
-                lead=round(LEAD * substeps / h),
+                lead=0 if name == "released" else round(LEAD * substeps / h),
                 steps=rows * fine,
                 seed=(int(rng.integers(2**31)), k),
             )

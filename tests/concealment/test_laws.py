@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_jax.concealment import LAWS, StrengthError, choose_place, hide, lookup_law, make_scene
+from bayessim_jax.concealment import LAWS, ModelLaw, StrengthError, choose_place, hide, lookup_law, make_scene
 from bayessim_jax.concealment.bristle import Bristle, RoundSign, draw_rounding
 from bayessim_jax.concealment.world import FINE, LONGEST, build, count_substeps
 from benchmarks.worlds import RIGS
@@ -115,6 +115,25 @@ def test_bristles_take_force_times_distance_and_then_hold():
     assert slide_to_rest(3.0, v=0.0, push=3.3)[1] == pytest.approx(0.3 / 2.0 * 2.0, rel=0.01)
 
 
+def test_a_third_of_all_dry_friction_is_a_constraint_of_the_solver():
+    made_of = [made("slide", "coulomb_friction", "joint/rail", 0.3, seed)[1] for seed in range(60)]
+    braked = [law for law in made_of if isinstance(law, ModelLaw)]
+    assert 10 < len(braked) < 30 and {law.coulomb for law in made_of} == {made_of[0].coulomb}
+    model = build(scene_of("slide").model, braked[:1])
+    data = mujoco.MjData(model)
+    data.qvel[0] = 1.0
+    mujoco.mj_step(model, data, 200)
+    assert data.qvel[0] == pytest.approx(1.0 - 200 * model.opt.timestep * made_of[0].coulomb / 5.0, rel=0.02)
+
+
+def test_what_is_let_go_begins_at_rest():
+    spec = mujoco.MjSpec.from_string(RIGS["pivot"].xml)
+    scene = make_scene(spec.compile(), np.random.default_rng(0), **SHORT | {"kind": "released"})
+    for track in scene.clean:
+        assert track.time[0] == track.rows[0] == 0 and track.qvel[0, 0] == 0.0
+        assert 0.3 < abs(track.qpos[0, 0]) < 1.3 and np.ptp(track.qpos[:, 0]) > abs(track.qpos[0, 0])
+
+
 def test_half_of_all_dry_friction_has_a_rounded_sign():
     spot = scene_of("pendulum").spot("joint/hinge")
     widths = [draw_rounding(spot, 0.1, np.random.default_rng(seed)) for seed in range(200)]
@@ -128,7 +147,8 @@ def test_half_of_all_dry_friction_has_a_rounded_sign():
 
 def test_friction_takes_no_energy_from_nowhere():
     for name in ("coulomb_friction", "stribeck_friction", "asymmetric_friction", "viscous_friction", "quadratic_drag"):
-        _, law = made("pendulum", name, "joint/hinge", 0.3)
+        drawn = (made("pendulum", name, "joint/hinge", 0.3, seed)[1] for seed in range(20))
+        law = next(law for law in drawn if not isinstance(law, ModelLaw))
         law.begin(type("Still", (), {"h": law.spot.h, "state": lambda self, joint: (0.0, 0.0)})(), None)
         rng = np.random.default_rng(0)
         v = np.repeat(rng.normal(0, law.spot.speed, 40), 400)
