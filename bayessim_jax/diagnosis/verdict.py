@@ -75,6 +75,8 @@ MIMICRY = 0.05
 """Chance that what looks like an effect is something else that is in no library."""
 VISIBLE = 0.5
 """Error of predictions over what cannot be predicted, from which a share of it says something."""
+CHAOTIC = 0.5
+"""Share of a channel's error beyond noise that noise in the initial states may make for it to say something."""
 SEVERAL = 4
 """Windows left out, from which one of them alone takes no answer away."""
 BOOTSTRAPS, FEW = 1000, 6
@@ -241,18 +243,23 @@ def error_left(
 ) -> float:
     """Share of the error of one prediction of windows that another one still has, beyond what cannot be predicted.
 
-    That is the sensors' noise and, by their noise in the initial states, `spread`, a variance. A window in which it
-    errs more, because motion there is chaotic, counts as not improved. NaN where the first errs hardly more than that.
+    That is the sensors' noise and, by their noise in the initial states, `spread`, a variance. A channel in which that
+    spread makes up for most of what the second prediction errs beyond noise tells nothing. A window in which the first
+    errs more than the second, because motion there is chaotic, counts as not improved. NaN where the second errs hardly
+    more than cannot be predicted.
     """
     measured, y = np.asarray(shots.measured), np.asarray(shots.y)
     large = 1e6
 
-    def total(squares: np.ndarray) -> np.ndarray:
+    def total(squares: np.ndarray, axes: tuple[int, ...] = (1, 2)) -> np.ndarray:
         finite = np.nan_to_num(squares, nan=large, posinf=large)
-        return np.where(measured, np.minimum(finite, large), 0.0).sum((1, 2))
+        return np.where(measured, np.minimum(finite, large), 0.0).sum(axes)
 
+    by_chance = np.broadcast_to(spread / noise**2, y.shape)
+    wrong = total(((y - base) / noise) ** 2 - 1.0, (0, 1))
+    measured = measured & (total(by_chance, (0, 1)) <= CHAOTIC * wrong)
     own, was = (total(((y - p) / noise) ** 2) for p in (predicted, base))
-    least = np.minimum(total(1.0 + spread / noise**2), was)
+    least = np.minimum(total(1.0 + by_chance), was)
     gap = (was - least).sum()
     if not gap > VISIBLE * least.sum():
         return float("nan")
@@ -307,7 +314,7 @@ def decide(
 
     sets = [entry for entry in sets if not any(is_coincidence(entry, other) for other in sets)]
     result.confusion = sorted(sets, key=lambda e: (len(bench.columns(e.candidate)), -e.score))
-    result.probabilities = _weigh(result, group, temper)
+    result.probabilities = _weigh(result, group, temper, thresholds)
     result.verdict = "explained" if len(sets) == 1 else "ambiguous"
     return result
 
@@ -339,7 +346,7 @@ def _tied(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> list
     simpler = (e for e in entries if e.score >= near and share_left(e.misfit, none.misfit) <= thresholds.form)
     tied += [e for e in simpler if e not in tied and any(has_special_case(other, e) for other in tied)]
     tied += [e for e in entries if e not in tied and any(_does_as_well(e, o, none, thresholds) for o in tied)]
-    return tied + [e for e in entries if e not in tied and any(_is_same(e, other, none) for other in tied)]
+    return tied + [e for e in entries if e not in tied and any(_is_same(e, other, none, thresholds) for other in tied)]
 
 
 def _is_clearer(entry: Entry, best: Entry, none: Entry, thresholds: Thresholds) -> bool:
@@ -362,11 +369,17 @@ def _does_as_well(entry: Entry, other: Entry, none: Entry, thresholds: Threshold
     return hardly_less and has_special_case(other, entry) and explains(entry, none, thresholds)
 
 
-def _is_same(entry: Entry, other: Entry, none: Entry) -> bool:
-    """Whether a set has a twin in another one's place and leaves the same: what tells them apart is no misfit."""
+def _is_same(entry: Entry, other: Entry, none: Entry, thresholds: Thresholds) -> bool:
+    """Whether a set has a twin in another one's place and leaves the same: what tells them apart is no misfit.
+
+    Nor is it where both leave next to nothing, but something, beside other effects: one of the twins has a number more,
+    which bends to the form of these.
+    """
     mine, its = _apart(entry, other)
     left, same = (share_left(e.misfit, none.misfit) for e in (entry, other))
-    return len(mine) == len(its) == 1 and _are_twins(*mine, *its) and abs(left - same) <= SAME * same
+    shows = len(entry.names) > 1 and all(e.misfit.p_value < FALSE_ALARMS for e in (entry, other))
+    alike = abs(left - same) <= SAME * same or (shows and max(left, same) <= thresholds.form)
+    return len(mine) == len(its) == 1 and _are_twins(*mine, *its) and alike
 
 
 def explains(entry: Entry, none: Entry, thresholds: Thresholds) -> bool:
@@ -549,7 +562,7 @@ def _apart(one: Entry, other: Entry) -> tuple[list[str], list[str]]:
     return [one.seats.get(name, name) for name in sorted(mine)], [other.seats.get(name, name) for name in sorted(its)]
 
 
-def _weigh(result: Diagnosis, group: Int[np.ndarray, " windows"], temper: float) -> list[float]:
+def _weigh(result: Diagnosis, group: Int[np.ndarray, " windows"], temper: float, thresholds: Thresholds) -> list[float]:
     """How probable every set of the confusion set is.
 
     Weights of all candidates by their held-out scores, tempered to what these can resolve, under the Bayesian
@@ -574,7 +587,8 @@ def _weigh(result: Diagnosis, group: Int[np.ndarray, " windows"], temper: float)
             own = own + (weight * stands / stands.sum() if stands.any() else 0.0)
     # what tells twins apart that leave the same is no misfit, and says nothing of which it is
     none, sets = result.baseline, result.confusion
-    same = np.array([[one is other or _is_same(one, other, none) for other in sets] for one in sets], float)
+    same = [[one is other or _is_same(one, other, none, thresholds) for other in sets] for one in sets]
+    same = np.array(same, float)
     own = same @ own / same.sum(1)
     explained = [1.0 - share_left(entry.misfit, none.misfit) for entry in sets]
     return [float((1.0 - MIMICRY) * w * part) for w, part in zip(own, explained, strict=True)]

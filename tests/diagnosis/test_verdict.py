@@ -281,6 +281,19 @@ def test_what_chaos_excuses_in_one_window_excuses_nothing_in_another():
     assert left == pytest.approx(20 * 3.0 / (20 * 5.0 + 20 * 9.0), rel=0.1)
 
 
+def test_a_joint_that_nobody_can_predict_says_nothing_of_an_effect_at_another():
+    """An arm whose shoulder drifts by what initial states are off, in each window otherwise, and its wrist's sensor."""
+    rng, shape = np.random.default_rng(0), (28, 50, 2)
+    off = rng.normal(size=(28, 1, 1)) * np.array([2.0, 0.0])
+    y = off + 0.1 * rng.normal(size=shape)
+    shots = Shots(None, y, np.ones(shape, bool), np.ones(2))
+    base, right = np.broadcast_to([0.0, 0.5], shape), np.zeros(shape)
+    spread = np.broadcast_to([3.0, 0.0], shape)
+    assert error_left(shots, right, base, np.full(2, 0.1), spread) < 0.01
+    half = np.broadcast_to([0.0, 0.25], shape)
+    assert error_left(shots, half, base, np.full(2, 0.1), spread) == pytest.approx(0.25, rel=0.1)
+
+
 def test_a_tie_with_what_does_not_explain_is_no_confusion():
     assert verdict(entry(["a@x"], 100.0, 0.002), entry(["b@x"], 100.0, 0.3, seed=1)).verdict == "explained"
 
@@ -316,6 +329,21 @@ def test_twins_that_leave_the_same_are_told_together(other, left, sets):
     found = verdict(best, second)
     assert len(found.confusion) == sets
     assert found.probabilities == pytest.approx([0.95 / sets] * sets, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("beside", "left", "p", "sets"),
+    [
+        (["gain_drift@joint/a"], 0.0004, 0.001, 2),
+        (["gain_drift@joint/a"], 0.0014, 0.001, 1),  # the twin leaves more than the form of a law
+        (["gain_drift@joint/a"], 0.0004, 0.3, 1),  # nothing shows that could bend the twin
+        ([], 0.0004, 0.001, 1),  # nothing beside it does
+    ],
+)
+def test_twins_beside_others_are_told_together_where_both_leave_next_to_nothing(beside, left, p, sets):
+    best = entry(["back_emf@joint/a", *beside], 1000.0, 0.0002, p)
+    found = verdict(best, entry(["viscous_friction@joint/a", *beside], 900.0, left, p))
+    assert len(found.confusion) == sets
 
 
 def test_a_set_stands_for_all_that_it_is_left_of():
