@@ -32,6 +32,7 @@ __all__ = [
     "find_shortsighted",
     "has_special_case",
     "is_outdone",
+    "is_worse",
     "is_worth",
     "leaves_much",
     "may_be_named",
@@ -431,6 +432,12 @@ def predicts_more(one: Errors, other: Errors, scale: Float[np.ndarray, " obs"]) 
     squares = _squares((one, other), scale)
     more = np.log(squares[1] / squares[0])
     return len(more) >= 2 and bool(more.sum() > 2.0 * error_of_sum(more))
+
+
+def is_worse(baseline: Errors, answer: Errors, scale: Float[np.ndarray, " obs"]) -> bool:
+    """Whether an answer errs more on recordings left out than the simulator without it, in all and in most windows."""
+    was, now = _squares((baseline, answer), scale).sum(1)
+    return bool(now > was) and predicts_more(baseline, answer, scale)
 
 
 def _squares(every: Sequence[Errors], scale: Float[np.ndarray, " obs"]) -> Float[np.ndarray, "simulator windows"]:

@@ -30,6 +30,7 @@ from bayessim_jax.diagnosis.verdict import (
     error_of_sum,
     falls_short,
     is_outdone,
+    is_worse,
     predicts_more,
     share_left,
 )
@@ -449,6 +450,8 @@ def _is_refuted(
     Where it is one `beside_a_rest`, a force without a name must not find that rest to be forces.
     """
     if falls_short(judging["baseline"], judging["augmented"], scale, floor, thresholds):
+        return True
+    if is_worse(judging["baseline"], judging["augmented"], scale):
         return True
     if "flexible" not in judging:
         return False

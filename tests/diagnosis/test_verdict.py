@@ -14,6 +14,7 @@ from bayessim_jax.diagnosis.verdict import (
     falls_short,
     find_shortsighted,
     is_outdone,
+    is_worse,
     may_be_named,
     predicts_more,
 )
@@ -116,6 +117,21 @@ def test_one_predicts_more_that_errs_less_in_most_windows(ratios, wanted):
     other = Errors(one.error * np.sqrt(ratios)[:, None, None], one.measured)
     one, other = (Errors(e.error * large, e.measured) for e in (one, other))
     assert predicts_more(one, other, np.ones(2)) == wanted
+
+
+@pytest.mark.parametrize(
+    ("answer", "wanted"),
+    [
+        ([0.3, 0.2, 0.25, 0.15, 0.3, 0.2, 0.1, 0.12], True),
+        ([0.3, 0.05, 0.09, 0.08, 0.2, 0.1, 0.07, 0.12], False),  # in some windows more, in others less
+        ([0.11, 0.105, 0.12, 0.11, 0.13, 0.11, 0.105, 0.02], False),  # a little more in most windows, not in one
+        ([0.02] * 8, False),
+    ],
+)
+def test_an_answer_that_predicts_worse_than_without_it_is_worse(answer, wanted):
+    baseline = uniform_errors(0.1)
+    errors = Errors(np.broadcast_to(np.array(answer)[:, None, None], baseline.error.shape), baseline.measured)
+    assert is_worse(baseline, errors, np.ones(2)) == wanted
 
 
 def uniform_errors(size, windows=8):
