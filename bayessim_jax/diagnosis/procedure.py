@@ -20,7 +20,7 @@ from bayessim_jax.beliefs.margins import Margins
 from bayessim_jax.diagnosis.bench import SLOTS, Bench, Candidate
 from bayessim_jax.diagnosis.response import Motion, cross_validate
 from bayessim_jax.diagnosis.scene import Scene
-from bayessim_jax.diagnosis.screen import LEAST_SHARE, Begun, Screen, Screened
+from bayessim_jax.diagnosis.screen import LEAST_SHARE, Begun, March, Screen, Screened
 from bayessim_jax.diagnosis.simulated_scene import SimulatedScene
 from bayessim_jax.diagnosis.verdict import (
     Diagnosis,
@@ -67,8 +67,9 @@ STUCK = 2.0
 begun from that one's numbers."""
 GLANCED = 4
 """Partners of a leader that are fitted to the end."""
-GLANCING, FIRST_STEPS = 6, 2
-"""Steps of the solver by which partners are ranked, and those by which many of them are at first."""
+GLANCING, FIRST_STEPS, BEGUN = 7, 1, 3
+"""Steps of the solver by which partners are ranked, those by which many of them are at first, and from how many points
+each of them goes on then."""
 WIDEST = 4
 """Effects of a set."""
 SIMPLE, AGAIN = 2, 4
@@ -358,12 +359,10 @@ class _Growth:
         ]
         self.seen.update(tried)
         many = len(tried) > RACED
-        beside = _each(self.screens, tried, lambda screen, s: screen.beside(s, known, self.alone.get(wider[s])))
-        begin = dict(zip(tried, beside, strict=True))
-        glanced = self._glance(known, begin, FIRST_STEPS if many else GLANCING)
+        glanced = self._glance(known, self._begin(known, tried, wider), FIRST_STEPS if many else GLANCING)
         if many:
             going = [list(glanced)[i] for i in _promising(first, [wider[s] for s in glanced])]
-            glanced = self._glance(known, {s: [end[1:] for end in glanced[s]] for s in going}, GLANCING)
+            glanced = self._glance(known, {s: glanced[s] for s in going}, GLANCING)
         best = list(glanced)[:GLANCED]
         # a glance may miss what its general case shows
         best += [
@@ -387,13 +386,24 @@ class _Growth:
         ended = [first.settle(p.candidate, p.p, p.delta, p.sigma) for p in parts if p.candidate not in but]
         return [each for each in ended if each is not None]
 
+    def _begin(
+        self, known: Screened, tried: Sequence[Candidate], added: Mapping[Candidate, int]
+    ) -> dict[Candidate, list[March]]:
+        """Fits of candidates that add an effect to what is known, before they move."""
+        found = _each(self.screens, tried, lambda screen, s: screen.beside(s, known, self.alone.get(added[s])))
+        return dict(zip(tried, found, strict=True))
+
     def _glance(
-        self, known: Screened, ends: Mapping[Candidate, Sequence[tuple[Any, Array]]], steps: int
-    ) -> dict[Candidate, list[tuple[float, Any, Array]]]:
-        """What a few steps lead to from points of every candidate: cost, p and δ; the best candidates first."""
-        found = _each(self.screens, list(ends), lambda screen, s: screen.glance(s, known, ends[s], steps))
-        finite = [(s, each) for s, each in zip(ends, found, strict=True) if each]
-        return dict(sorted(finite, key=lambda item: item[1][0][0]))
+        self, known: Screened, marches: Mapping[Candidate, Sequence[March]], steps: int
+    ) -> dict[Candidate, list[March]]:
+        """The best fits of every candidate after so many steps; the best candidates first."""
+
+        def glance(screen: Screen, s: Candidate) -> list[March]:
+            return screen.glance(s, known, marches[s], steps)[:BEGUN]
+
+        found = _each(self.screens, list(marches), glance)
+        begun = [(s, each) for s, each in zip(marches, found, strict=True) if each]
+        return dict(sorted(begun, key=lambda item: item[1][0].promised))
 
 
 def _search(screen: Screen, candidate: Candidate, known: Screened) -> Screened | None:

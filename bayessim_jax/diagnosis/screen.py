@@ -29,7 +29,7 @@ from bayessim_jax.effects import EffectParameter
 from bayessim_jax.inference.direct import noise_floor, noise_level
 from bayessim_jax.inference.shooting import in_units
 
-__all__ = ["Begun", "Screen", "Screened"]
+__all__ = ["Begun", "March", "Screen", "Screened"]
 
 ITERATIONS, AGAIN = 6, 3
 """Steps of the solver with the noise of before, and then with its own."""
@@ -40,8 +40,8 @@ FALLING = 6
 RACES = ((3, False, 4), (4, True, 2), (6, True, 2))
 """Steps of the solver from the points that a candidate is begun from, whether parameters that are scanned move, and how
 many points go on; one race after the other."""
-SCAN = ((2, False, 2),)
-"""The same for a scan beside what is known."""
+SCAN, SCANNED = ((2, False, 2),), 2
+"""The same for a scan beside what is known, of what weighs on a body, and how many points of other scans go on."""
 LEFT = 2
 """Of the points that go on from a race, how many times as many are left at least in the midst of it."""
 SAME = 0.05
@@ -62,7 +62,7 @@ EDGE = 0.02
 
 
 @dataclass
-class _March:
+class March:
     """Where Levenberg and Marquardt's method stands: the point that is tried next, and the best one so far."""
 
     tried: tuple[Any, Array]
@@ -76,6 +76,7 @@ class _March:
 
     @property
     def cost(self) -> float:
+        """Of the best point so far; infinite without one."""
         return float(self.here[2].cost) if self.here else np.inf
 
     def stop(self) -> None:
@@ -83,7 +84,7 @@ class _March:
         self.steps, self.promised = np.inf, self.cost
 
 
-def _distinct(marches: Sequence[_March]) -> list[tuple[Any, Array]]:
+def _distinct(marches: Sequence[March]) -> list[tuple[Any, Array]]:
     """(p, δ) of those that are not where one before them is."""
     found: list[tuple[Any, Array]] = []
     for march in marches:
@@ -178,13 +179,13 @@ class Screen:
         Where the point costs more than `bad`, the first step is θ's alone: a rotor takes from the mass that was fitted
         without it. Returns (p, δ, curvature, residuals).
         """
-        march = _March((np.asarray(p), delta))
+        march = March((np.asarray(p), delta))
         self._advance(march, candidate, sigma, iterations, iterations, scanned, bad)
         return march.here or (p, delta, None, None)
 
     def _advance(
         self,
-        march: _March,
+        march: March,
         candidate: Candidate,
         sigma: Array,
         until: int,
@@ -319,7 +320,7 @@ class Screen:
         likelihood = -np.inf
         for steps, scanned, kept in races:
             steps += FALLING if weighs and len(ends) > kept else 0
-            marches = [_March((np.asarray(p), delta)) for p, delta in ends]
+            marches = [March((np.asarray(p), delta)) for p, delta in ends]
             for third in (1, 2, 3):
                 for march in marches:
                     self._advance(march, candidate, known.sigma, third * steps // 3, steps, scanned, bad)
@@ -428,8 +429,8 @@ class Screen:
 
     def beside(
         self, candidate: Candidate, known: Screened, alone: Float[np.ndarray, " e"] | None = None
-    ) -> list[tuple[Any, Array]]:
-        """Points (p, δ) of a candidate beside a fit of a part of it.
+    ) -> list[March]:
+        """Fits of a candidate beside a fit of a part of it, which begin from several points.
 
         What is added begins nearly neutral, as usual, or as it was fitted `alone`; where parameters are scanned, and
         with what weighs on a body and has several, also at the best points of a scan beside what is known.
@@ -438,24 +439,32 @@ class Screen:
         begin, weak = self._begin(added), self._begin(added, NEAR)
         points = [weak, begin] if np.abs(begin - weak).max(initial=0.0) > 0.0 else [begin]
         starts = [*points, *([alone] if alone is not None else [])]
-        ends = [(self._put(candidate, known, start), known.delta) for start in starts]
+
+        def begin_at(points: Iterable[Float[np.ndarray, " e"]]) -> list[tuple[Any, Array]]:
+            return [(self._put(candidate, known, point), known.delta) for point in points]
+
+        marches = [March(point) for point in begin_at(starts)]
         scanned = any(p.scan for k in added.effects for p in self.scene.parameters[k])
         loads = [k for k in added.effects if self.pairs[k][0].port == "model" and self._weighs((k,))]
         if scanned or any(len(self.scene.parameters[k]) > 1 for k in loads):
-            scan = [(self._put(candidate, known, start), known.delta) for start in self.starts(added)]
+            scan = begin_at(self.starts(added))
             self.scene.begin_around(known.candidate, known.p)
-            found = self._race(candidate, known, scan, SCAN)
-            ends += found.ends if found is not None else []
-        return ends
+            if loads:
+                found = self._race(candidate, known, scan, SCAN)
+                marches += [March(end) for end in found.ends] if found is not None else []
+            else:
+                tried = [March(point) for point in scan]
+                for march in tried:
+                    self._advance(march, candidate, known.sigma, 1, 2, False, np.inf)
+                marches += sorted((m for m in tried if m.here), key=lambda march: march.promised)[:SCANNED]
+        return marches
 
-    def glance(
-        self, candidate: Candidate, known: Screened, ends: Sequence[tuple[Any, Array]], steps: int
-    ) -> list[tuple[float, Any, Array]]:
-        """Cost, p and δ after a few steps from points beside what is known, the best first."""
+    def glance(self, candidate: Candidate, known: Screened, marches: Sequence[March], steps: int) -> list[March]:
+        """Fits beside what is known after so many steps; those first that promise the least cost after one more."""
         self.scene.begin_around(known.candidate, known.p)
-        tried = [self.fit(candidate, p, delta, known.sigma, steps) for p, delta in ends]
-        found = [(float(curvature.cost), p, delta) for p, delta, curvature, _ in tried if curvature is not None]
-        return sorted(found, key=lambda item: item[0])
+        for march in marches:
+            self._advance(march, candidate, known.sigma, steps, steps + 1, True, np.inf)
+        return sorted((march for march in marches if march.here), key=lambda march: march.promised)
 
     def _begin(self, candidate: Candidate, share: float = 1.0) -> Float[np.ndarray, " e"]:
         """A candidate's x where a fit begins."""

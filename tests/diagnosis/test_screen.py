@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bayessim_jax.diagnosis.bench import Candidate
-from bayessim_jax.diagnosis.screen import Screen, Screened
+from bayessim_jax.diagnosis.screen import March, Screen, Screened
 from bayessim_jax.inference.shooting import Curvature
 
 DEEPEST = 1.3
@@ -99,3 +99,21 @@ def test_points_that_came_together_go_on_as_one(screen):
     found = sorted(float(p[0]) for p, _ in begun.ends)
     assert len(found) == 2
     assert found == pytest.approx([DEEPEST - 2 * np.pi / 5, DEEPEST], abs=0.05)
+
+
+def test_a_glance_costs_a_point_one_evaluation_and_goes_on_from_there(screen):
+    screen.scene.begin_around = lambda candidate, p: None
+    known = Screened(Candidate(), jnp.zeros(1), jnp.zeros((1, 1)), jnp.ones(1), np.inf, 0.0)
+
+    def marches():
+        return [March((np.array([x]), jnp.zeros((1, 1)))) for x in (-2.0, 0.5, 1.2, 2.6)]
+
+    first = screen.glance(Candidate((0,)), known, marches(), 1)
+    assert len(screen.scene.points) == 4
+    assert [march.promised for march in first] == sorted(march.promised for march in first)
+    assert len(first) == 3  # one began where nothing can be said
+    gone_on = screen.glance(Candidate((0,)), known, first, 7)
+    in_one_go = screen.glance(Candidate((0,)), known, marches(), 7)
+    for one, other in zip(gone_on, in_one_go, strict=True):
+        assert one.cost == other.cost
+    assert gone_on[0].here[0][0] == pytest.approx(DEEPEST, abs=1e-3)
