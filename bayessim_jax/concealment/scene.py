@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Scene", "make_scene"]
 
-SAMPLES, FEW = 4000, 400
-"""At most so many rows are looked at where forces are measured, and where they are measured again and again."""
+SAMPLES = 4000
+"""At most so many rows are looked at where forces are measured."""
 
 LEAST = 1e-9
 """N or N m; a joint on which less acts is moved by nothing."""
@@ -97,9 +97,9 @@ class Scene:
         ratio = rms[0] / np.maximum(rms[1], 1e-12)
         return float(ratio[spot.v] if spot.joint >= 0 else ratio[rms[1] > LEAST].max(initial=0.0))
 
-    def lack(self, model: mujoco.MjModel, tracks: Sequence[Track]) -> Forces:
+    def lack(self, model: mujoco.MjModel, tracks: Sequence[Track], samples: int = SAMPLES) -> Forces:
         """What a model with other parameters lacks, in units of the root mean square that acts on every joint."""
-        missing, applied, _ = _forces(model, tracks, FEW)
+        missing, applied, _ = _forces(model, tracks, samples)
         return missing / np.maximum(np.sqrt(np.mean(applied**2, axis=0)), LEAST)
 
     def _sizes(self, joint: int) -> dict[str, float]:

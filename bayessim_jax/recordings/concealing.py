@@ -32,8 +32,8 @@ SEALED = "sealed.json"
 """The file of a case that says what is concealed in it; nothing that diagnoses reads it."""
 NOISE = {HINGE: 1e-3, SLIDE: 2e-4}
 """Standard deviation of the noise of positions, rad and m; of velocities ten times as much for a second."""
-TRIES = 20
-"""Steps, at most, in which the parameters are sought that make up for most of what is concealed."""
+TRIES, FEW = 20, 400
+"""Steps, at most, in which the parameters are sought that make up for most of what is concealed, and rows looked at."""
 NOTHING = 0.01
 """Strength, below which what a model lacks is nothing."""
 MIDDLE = 0.7
@@ -237,16 +237,16 @@ def _lacks(
     """
     low, high = np.array(list(priors.values())).reshape(-1, 2).T
 
-    def lack(share: np.ndarray) -> np.ndarray:
+    def lack(share: np.ndarray, **samples: int) -> np.ndarray:
         model = _machine(spec.copy(), dict(zip(priors, (low + share * (high - low)).tolist(), strict=True)))
-        return scene.lack(model, tracks)
+        return scene.lack(model, tracks, **samples)
 
     def size(missing: np.ndarray) -> float:
         return round(float(np.sqrt(np.mean(missing**2, axis=0)).max(initial=0.0)), 6)
 
     begun = (np.array([truth[target] for target in priors]) - low) / (high - low)
     found = (
-        least_squares(lambda share: lack(share).ravel(), begun, bounds=(0.0, 1.0), max_nfev=TRIES).x
+        least_squares(lambda share: lack(share, samples=FEW).ravel(), begun, bounds=(0.0, 1.0), max_nfev=TRIES).x
         if priors
         else begun
     )

@@ -92,6 +92,15 @@ def test_the_strength_of_a_spring_is_that_of_its_force():
     assert scene.strength(law.spot, scene.play([double])) < 0.25 * applied
 
 
+def test_what_the_true_model_lacks_is_the_strength_also_of_what_is_short():
+    scene, law = made("pendulum", "actuator_rate_limit", "actuator/motor", 0.3)
+    tracks = scene.play([law])
+    lacks = scene.lack(scene.model, tracks)
+    motors = np.sort(np.abs(lacks[:, 0]))
+    assert (motors[-len(motors) // 10 :] ** 2).sum() > 0.7 * (motors**2).sum()  # in a tenth of the rows
+    assert np.sqrt(np.mean(lacks[:, 0] ** 2)) == pytest.approx(scene.strength(law.spot, tracks), rel=1e-9)
+
+
 def test_what_cannot_be_as_strong_is_refused():
     with pytest.raises(StrengthError, match="out of reach") as told:
         hide(scene_of("pendulum"), "actuator_saturation", "actuator/motor", 5.0, seed=0)
