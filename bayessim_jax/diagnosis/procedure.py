@@ -729,6 +729,18 @@ def _replacements(bench: Bench, tied: Sequence[Entry], tried: Collection[Candida
     return fresh[: max(AGAIN, sum(entry is best for _, entry in fresh))]
 
 
+def _recall(
+    bench: Bench, none: Entry, entries: list[Entry], before: Mapping[Candidate, Entry], thresholds: Thresholds
+) -> list[Entry]:
+    """The same with what was tried before in the places of sets that tie, the best first."""
+    while True:
+        tied, tried = contenders(entries, none, thresholds), {entry.candidate for entry in entries}
+        known = [before[s] for s, _ in _replacements(bench, tied, tried) if s in before]
+        if not known:
+            return entries
+        entries = sorted([*entries, *known], key=lambda e: -e.score)
+
+
 def _with_numbers_of(bench: Bench, best: Entry, other: Candidate, start: Float[Array, " k"]) -> Float[Array, " k"]:
     """Another candidate's point with the numbers of the best, as far as they have the same names."""
     found = dict(zip(bench.columns(best.candidate), np.asarray(best.fit.z)[bench.d :].tolist(), strict=False))
@@ -820,6 +832,7 @@ def _finish(
         _replace(work, entries, zip(trading, pool.map(from_traded, trading), strict=True))
         compared: set[tuple[Entry, Entry]] = set()
         for _ in range(TURNS if entries else 0):
+            entries = _recall(bench, none, entries, before, thresholds)
             best = entries[0]
             tried = {entry.candidate for entry in entries}
             tied = contenders(entries, none, thresholds)
