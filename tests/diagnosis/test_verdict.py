@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bayessim_jax.diagnosis.bench import Candidate
-from bayessim_jax.diagnosis.procedure import _is_too_narrow
+from bayessim_jax.diagnosis.procedure import _is_too_narrow, _recall
 from bayessim_jax.diagnosis.verdict import (
     Entry,
     Thresholds,
@@ -34,6 +34,24 @@ def entry(names, mean, left, p=0.001, spread=1.0, seed=0):
     scores = mean + spread * np.random.default_rng(seed).normal(size=WINDOWS)
     misfit = Misfit(p, np.full((WINDOWS, 1), left), np.ones(1), np.ones(WINDOWS, bool))
     return Entry(Candidate(tuple(range(len(names)))), list(range(len(names))), names, None, scores, misfit)
+
+
+class Laws(OneParameterEach):
+    """Three effects of one joint, each with one parameter."""
+
+    pairs = ("load_dependent_friction", "coulomb_friction", "armature")
+    slots = 10
+
+    def name(self, k):
+        return f"{self.pairs[k]}@joint/a"
+
+    def seats(self, candidate):
+        return {}
+
+    def entry(self, *effects, mean, left):
+        found = entry([self.name(k) for k in effects], mean, left)
+        found.candidate = Candidate(effects)
+        return found
 
 
 def verdict(*entries, none=None):
@@ -473,3 +491,11 @@ def test_what_ties_for_the_best_or_is_a_part_of_that_may_be_named():
     every = [best, second, other, part]
     asked = [may_be_named(each, every, entry([], 0.0, 1.0), Thresholds()) for each in every]
     assert asked == [True, True, False, True]
+
+
+def test_a_special_case_that_was_tried_before_is_there_when_its_law_is_looked_at_again():
+    laws, none = Laws(), entry([], 0.0, 1.0)
+    law, special = laws.entry(0, 2, mean=100.0, left=1e-4), laws.entry(1, 2, mean=100.0, left=1e-4)
+    before = {each.candidate: each for each in (law, special)}
+    assert _recall(laws, none, [law], before, Thresholds()) == [law, special]
+    assert _recall(laws, none, [law], {law.candidate: law}, Thresholds()) == [law]
