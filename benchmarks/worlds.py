@@ -143,8 +143,12 @@ def make_case(
     with tempfile.TemporaryDirectory() as place:
         model = Path(place) / "model.xml"
         model.write_text(about.xml.replace(own, f'timestep="{float(STEP) / finer:.9g}"'), encoding="utf-8")
-        usual: dict[str, Any] = {"parameters": about.parameters, "horizon": about.horizon, "motions": about.motions}
-        usual["rate"] = 0.5 / float(STEP)
+        usual: dict[str, Any] = {
+            "parameters": about.parameters,
+            "horizon": about.horizon,
+            "motions": about.motions,
+            "rate": 0.5 / float(STEP),
+        }
         sealed = conceal(folder, model, effect, **(usual | settings))
     (folder / "model.xml").write_text(about.xml, encoding="utf-8")
     return sealed

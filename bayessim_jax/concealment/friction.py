@@ -28,7 +28,7 @@ __all__ = [
 
 
 BRAKED = 1 / 3
-"""Share of machines whose dry friction is a constraint of MuJoCo's own solver."""
+"""Share of machines whose Coulomb friction is a constraint of MuJoCo's own solver."""
 SHARP = 0.2
 """Of Stribeck's velocity: a sign that is rounded over more of it hides what falls there."""
 
@@ -91,7 +91,7 @@ class CoulombFriction(DryFriction):
         """F_c in units of the joint's force."""
         level = amplitude * spot.force
         rounding = draw_rounding(spot, level, rng)
-        return Brake(spot, level) if rng.uniform() < BRAKED else cls(spot, level, rounding)
+        return Brake.make(spot, amplitude, rng) if rng.uniform() < BRAKED else cls(spot, level, rounding)
 
     def force(self, world: World, q: float, v: float) -> float:
         """The bristles', or that of a rounded sign."""

@@ -82,6 +82,7 @@ SIGNALS: dict[str, Callable[[np.random.Generator, np.ndarray], np.ndarray]] = {
 KINDS = ("mixed", *SIGNALS)
 """What can be asked for; `mixed` takes sines, a chirp and steps in turn. `released` begins at rest, `free` does not."""
 UNDRIVEN = ("free", "released")
+"""Those in which motors that may be off exert nothing."""
 
 
 def draw_motions(

@@ -713,8 +713,10 @@ def _stand_ins(bench: Bench, candidate: Candidate, siblings: bool = False) -> li
     return [each for each in found if len(bench.columns(each)) <= bench.slots]
 
 
-def _replacements(bench: Bench, tied: Sequence[Entry], tried: Collection[Candidate]) -> list[tuple[Candidate, Entry]]:
-    """What is to be tried in the places of sets that tie, the best first, and the set whose numbers each begins from.
+def _replacements(bench: Bench, tied: Sequence[Entry], entries: Sequence[Entry]) -> list[tuple[Candidate, Entry]]:
+    """What may stand in the places of sets that tie, the best first, and the set whose numbers each begins from.
+
+    As far as it is not among the `entries`.
 
     Of the best all, so that none is named for want of another law beside its other effects, and siblings where it has
     several and leaves something: which of laws that all do comes out best may be chance. Of the others few.
@@ -725,6 +727,7 @@ def _replacements(bench: Bench, tied: Sequence[Entry], tried: Collection[Candida
     for entry in tied:
         for each in _stand_ins(bench, entry.candidate, siblings=vague and entry is best):
             found.setdefault(each, entry)
+    tried = {entry.candidate for entry in entries}
     fresh = [(each, entry) for each, entry in found.items() if each not in tried]
     return fresh[: max(AGAIN, sum(entry is best for _, entry in fresh))]
 
@@ -734,8 +737,8 @@ def _recall(
 ) -> list[Entry]:
     """The same with what was tried before in the places of sets that tie, the best first."""
     while True:
-        tied, tried = contenders(entries, none, thresholds), {entry.candidate for entry in entries}
-        known = [before[s] for s, _ in _replacements(bench, tied, tried) if s in before]
+        tied = contenders(entries, none, thresholds)
+        known = [before[s] for s, _ in _replacements(bench, tied, entries) if s in before]
         if not known:
             return entries
         entries = sorted([*entries, *known], key=lambda e: -e.score)
@@ -834,11 +837,10 @@ def _finish(
         for _ in range(TURNS if entries else 0):
             entries = _recall(bench, none, entries, before, thresholds)
             best = entries[0]
-            tried = {entry.candidate for entry in entries}
             tied = contenders(entries, none, thresholds)
             if all(entry.candidate in before for entry in tied):
                 break
-            simpler = _replacements(bench, tied, tried)
+            simpler = _replacements(bench, tied, entries)
             begun = [_with_numbers_of(bench, e, s, bench.starts(s, jnp.zeros(bench.d))[-1]) for s, e in simpler]
             found = pool.map(lambda pair, p: enter(pair[0], p, pair[1].fit.sigma), simpler, begun)
             entries = sorted([*entries, *(e for e in found if e is not None)], key=lambda e: -e.score)

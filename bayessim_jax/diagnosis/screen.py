@@ -448,22 +448,24 @@ class Screen:
         loads = [k for k in added.effects if self.pairs[k][0].port == "model" and self._weighs((k,))]
         if scanned or any(len(self.scene.parameters[k]) > 1 for k in loads):
             scan = begin_at(self.starts(added))
-            self.scene.begin_around(known.candidate, known.p)
             if loads:
+                self.scene.begin_around(known.candidate, known.p)
                 found = self._race(candidate, known, scan, SCAN)
                 marches += [March(end) for end in found.ends] if found is not None else []
             else:
-                tried = [March(point) for point in scan]
-                for march in tried:
-                    self._advance(march, candidate, known.sigma, 1, 2, False, np.inf)
-                marches += sorted((m for m in tried if m.here), key=lambda march: march.promised)[:SCANNED]
+                marches += self.glance(candidate, known, [March(point) for point in scan], 1, scanned=False)[:SCANNED]
         return marches
 
-    def glance(self, candidate: Candidate, known: Screened, marches: Sequence[March], steps: int) -> list[March]:
-        """Fits beside what is known after so many steps; those first that promise the least cost after one more."""
+    def glance(
+        self, candidate: Candidate, known: Screened, marches: Sequence[March], steps: int, scanned: bool = True
+    ) -> list[March]:
+        """Fits beside what is known after so many steps; those first that promise the least cost after one more.
+
+        Parameters that are `scanned` may stay where they are.
+        """
         self.scene.begin_around(known.candidate, known.p)
         for march in marches:
-            self._advance(march, candidate, known.sigma, steps, steps + 1, True, np.inf)
+            self._advance(march, candidate, known.sigma, steps, steps + 1, scanned, np.inf)
         return sorted((march for march in marches if march.here), key=lambda march: march.promised)
 
     def _begin(self, candidate: Candidate, share: float = 1.0) -> Float[np.ndarray, " e"]:

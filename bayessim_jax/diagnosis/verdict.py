@@ -252,20 +252,21 @@ def error_left(
     measured, y = np.asarray(shots.measured), np.asarray(shots.y)
     large = 1e6
 
-    def total(squares: np.ndarray, axes: tuple[int, ...] = (1, 2)) -> np.ndarray:
+    def total(squares: np.ndarray, there: np.ndarray, axes: tuple[int, int]) -> np.ndarray:
         finite = np.nan_to_num(squares, nan=large, posinf=large)
-        return np.where(measured, np.minimum(finite, large), 0.0).sum(axes)
+        return np.where(there, np.minimum(finite, large), 0.0).sum(axes)
 
     by_chance = np.broadcast_to(spread / noise**2, y.shape)
-    wrong = total(((y - base) / noise) ** 2 - 1.0, (0, 1))
-    measured = measured & (total(by_chance, (0, 1)) <= CHAOTIC * wrong)
-    own, was = (total(((y - p) / noise) ** 2) for p in (predicted, base))
-    least = np.minimum(total(1.0 + by_chance), was)
+    missed, was_missed = (((y - p) / noise) ** 2 for p in (predicted, base))
+    chance, wrong = (total(squares, measured, (0, 1)) for squares in (by_chance, was_missed - 1.0))
+    told = measured & (chance <= CHAOTIC * wrong)
+    own, was, noisy = (total(squares, told, (1, 2)) for squares in (missed, was_missed, 1.0 + by_chance))
+    least = np.minimum(noisy, was)
     gap = (was - least).sum()
     if not gap > VISIBLE * least.sum():
         return float("nan")
     # an error below what chaos excuses in one window says nothing of another one; noise alone is as often below
-    luck = 3.0 * np.sqrt(2.0 * measured.sum((1, 2)))
+    luck = 3.0 * np.sqrt(2.0 * told.sum((1, 2)))
     return float(max(np.maximum(np.minimum(own, was) - least, -luck).sum(), 0.0) / gap)
 
 
@@ -594,8 +595,8 @@ def _weigh(result: Diagnosis, group: Int[np.ndarray, " windows"], temper: float,
             own = own + (weight * stands / stands.sum() if stands.any() else 0.0)
     # what tells twins apart that leave the same is no misfit, and says nothing of which it is
     none, sets = result.baseline, result.confusion
-    same = [[one is other or _is_same(one, other, none, thresholds) for other in sets] for one in sets]
-    same = np.array(same, float)
+    alike = [[one is other or _is_same(one, other, none, thresholds) for other in sets] for one in sets]
+    same = np.array(alike, float)
     own = same @ own / same.sum(1)
     explained = [1.0 - share_left(entry.misfit, none.misfit) for entry in sets]
     return [float((1.0 - MIMICRY) * w * part) for w, part in zip(own, explained, strict=True)]

@@ -237,20 +237,19 @@ def _lacks(
     """
     low, high = np.array(list(priors.values())).reshape(-1, 2).T
 
-    def lack(share: np.ndarray, **samples: int) -> np.ndarray:
-        model = _machine(spec.copy(), dict(zip(priors, (low + share * (high - low)).tolist(), strict=True)))
-        return scene.lack(model, tracks, **samples)
+    def model(share: np.ndarray) -> Any:
+        return _machine(spec.copy(), dict(zip(priors, (low + share * (high - low)).tolist(), strict=True)))
 
-    def size(missing: np.ndarray) -> float:
+    def lack(share: np.ndarray) -> np.ndarray:
+        return scene.lack(model(share), tracks, FEW).ravel()
+
+    def size(share: np.ndarray) -> float:
+        missing = scene.lack(model(share), tracks)
         return round(float(np.sqrt(np.mean(missing**2, axis=0)).max(initial=0.0)), 6)
 
     begun = (np.array([truth[target] for target in priors]) - low) / (high - low)
-    found = (
-        least_squares(lambda share: lack(share, samples=FEW).ravel(), begun, bounds=(0.0, 1.0), max_nfev=TRIES).x
-        if priors
-        else begun
-    )
-    return {"with_truth": size(lack(begun)), "with_best": size(lack(found))}
+    found = least_squares(lack, begun, bounds=(0.0, 1.0), max_nfev=TRIES).x if priors else begun
+    return {"with_truth": size(begun), "with_best": size(found)}
 
 
 def _are_alike(one: Any, other: Any) -> bool:

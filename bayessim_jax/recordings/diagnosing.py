@@ -449,15 +449,14 @@ def _is_refuted(
 
     Where it is one `beside_a_rest`, a force without a name must not find that rest to be forces.
     """
-    if falls_short(judging["baseline"], judging["augmented"], scale, floor, thresholds):
+    baseline, answer, flexible = judging["baseline"], judging["augmented"], judging.get("flexible")
+    if falls_short(baseline, answer, scale, floor, thresholds) or is_worse(baseline, answer, scale):
         return True
-    if is_worse(judging["baseline"], judging["augmented"], scale):
-        return True
-    if "flexible" not in judging:
+    if flexible is None:
         return False
-    if beside_a_rest and predicts_more(judging["flexible"], judging["augmented"], scale):
+    if beside_a_rest and predicts_more(flexible, answer, scale):
         return True
-    return is_outdone(judging["baseline"], judging["augmented"], judging["flexible"], scale, thresholds)
+    return is_outdone(baseline, answer, flexible, scale, thresholds)
 
 
 def _absorbed(problem: Problem, none: Entry) -> list[str]:
