@@ -157,6 +157,10 @@ class Bench:
         self.first = np.cumsum([0, *(len(w.parameters) for w in self.wired)])
         self.each: list[Margin] = [margin_of_effect(p) for p in self.parameters]
 
+    def on(self, shots: Shots) -> Bench:
+        """The same with other windows, or what else was recorded in them."""
+        return Bench(self.system, self.margins, self.pairs, self.scales, shots, self.step, self.slots)
+
     @property
     def d(self) -> int:
         """Parameters of the system."""

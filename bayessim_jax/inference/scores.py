@@ -67,13 +67,21 @@ def predict_windows(
     """
     windows = shots.y.shape[0]
     still = np.zeros((windows, shots.spread.size), np.asarray(shots.spread).dtype)
-    every = jax.tree.map(np.asarray, (still if delta is None else delta, shots.inputs))
+    every = jax.tree.map(np.asarray, (still if delta is None else delta, _of_each_window(shots)))
     found = [np.zeros((0, *shots.y.shape[1:]))]
     for first in range(0, windows, CHUNK):
         which = np.minimum(np.arange(first, first + CHUNK), windows - 1)
         moved, inputs = jax.tree.map(lambda x, which=which: x[which], every)
         found.append(np.asarray(_predict(predict, inputs, z, moved)))
     return np.concatenate(found)[:windows]
+
+
+def _of_each_window(shots: Shots) -> Any:
+    """Inputs with a leading axis over windows, of what all share as well."""
+    count = shots.y.shape[0]
+    spread = lambda x: np.broadcast_to(x, (count, *np.shape(x)))  # noqa: E731
+    own = lambda axis, part: jax.tree.map(spread, part) if axis is None else part  # noqa: E731
+    return jax.tree.map(own, shots.axes, shots.inputs, is_leaf=lambda axis: axis is None)
 
 
 @trace_once(static_argnames="predict", compiler_options=COMPILER_OPTIONS)

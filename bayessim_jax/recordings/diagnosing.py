@@ -41,7 +41,7 @@ from bayessim_jax.inference.shooting import Shots
 from bayessim_jax.recordings.experiments import advise, next_experiment
 from bayessim_jax.recordings.identification import channel_scale, start_spread
 from bayessim_jax.recordings.shots import CaseModel, interpolate, split_numbers, take
-from bayessim_jax.recordings.stepping import RATIO, Settled, settle_step
+from bayessim_jax.recordings.stepping import RATIO, Settled, settle_answer, settle_step
 from bayessim_jax.recordings.windows import Windows, cut_windows
 
 __all__ = ["CaseDiagnosis", "diagnose_case"]
@@ -274,6 +274,17 @@ def _settle_with(taken: _Taken, bench: Bench, best: Entry, thresholds: Threshold
     return dataclasses.replace(taken, model=model, whole=whole, problem=problem, settled=settled)
 
 
+def _settle_answer(taken: _Taken, result: Diagnosis) -> _Taken:
+    """The case with what the time step does to the answer, whose entries are fitted to what is left."""
+    named = result.names_something
+    if not named and result.verdict != "no_mismatch":
+        return taken
+    pieces = taken.pieces if named else take(taken.windows, taken.chosen)
+    entries = result.confusion if named else [result.baseline]
+    model, result.bench = settle_answer(taken.model, pieces, result.bench, entries, taken.settled.moved)
+    return dataclasses.replace(taken, model=model)
+
+
 def _lowest(places: Float[np.ndarray, " n"], costs: Float[np.ndarray, " n"]) -> float:
     """Where a parabola through the lowest of costs at even places, and its neighbours, is lowest; within the places."""
     k = int(np.clip(np.argmin(costs), 1, len(costs) - 2))
@@ -366,6 +377,7 @@ def diagnose_case(
     taken = _take_case(fit_key, model, list(EFFECTS.values()) if effects is None else effects, say)
     say(f"{int(taken.chosen.sum())} windows choose, {int((~taken.chosen).sum())} judge")
     taken, result, residual = _explain(key, taken, thresholds, say)
+    taken = _settle_answer(taken, result)
     model, windows, chosen = taken.model, taken.windows, taken.chosen
     none, bench, shots = result.baseline, result.bench, model.shots(windows)
     scale = channel_scale(shots)

@@ -18,7 +18,7 @@ from bayessim_jax.beliefs.margins import Margin, Margins, log_normal, normal, un
 from bayessim_jax.contracts import Box
 from bayessim_jax.inference.replay import Inputs, Replay, Restarted
 from bayessim_jax.inference.scores import predict_windows
-from bayessim_jax.inference.shooting import Shots
+from bayessim_jax.inference.shooting import Predict, Shots
 from bayessim_jax.recordings.priors import LogNormal, Normal, Prior
 from bayessim_jax.recordings.recording import CaseRecording, resample
 from bayessim_jax.recordings.smoothing import smooth_recordings
@@ -28,6 +28,7 @@ from bayessim_jax.recordings.windows import Windows, stack_windows
 from bayessim_jax.systems.mjcf import MjcfSystem, Unknown, mjcf_system
 
 if TYPE_CHECKING:
+    from bayessim_jax.diagnosis.bench import Bench, Candidate
     from bayessim_jax.recordings.loading import LoadedCase
 
 __all__ = [
@@ -196,6 +197,8 @@ class StepError:
     z: Float[Array, " d"]
     ratio: float = 0.0
     """The s of what was recorded: 0 for a machine."""
+    answer: tuple[Bench, Candidate] | None = None
+    """Effects that are simulated, too, and their bench; z has their numbers then."""
 
     @property
     def nodes(self) -> tuple[float, ...]:
@@ -206,7 +209,13 @@ class StepError:
         self, shots: Shots, refined: int, delta: Float[Array, "windows n"] | None = None
     ) -> Float[np.ndarray, "windows nodes rows obs"]:
         """Predictions y_k less those with h / `refined`; zero where nothing was measured."""
-        each = [predict_windows(predictor(m), shots, self.z, delta) for m in self.models]
+        predicts: list[Predict] = [predictor(m) for m in self.models]
+        if self.answer is not None:
+            bench, candidate = self.answer
+            shots = bench.setup(candidate, shots)
+            simulator = bench.simulator(candidate)
+            predicts = [dataclasses.replace(simulator, system=m.system) for m in self.models]
+        each = [predict_windows(predict, shots, self.z, delta) for predict in predicts]
         found = np.stack([y - each[self.nodes.index(1 / refined)] for y in each], axis=1)
         there = np.asarray(shots.measured) & np.isfinite(found).all(1)
         return np.where(there[:, None], found, 0.0)

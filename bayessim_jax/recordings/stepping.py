@@ -14,7 +14,7 @@ Source: Richardson 1911 (extrapolation to the limit); Kennedy and O'Hagan 2001 (
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import jax.numpy as jnp
@@ -24,10 +24,12 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from bayessim_jax.beliefs.margins import Margins, normal
+from bayessim_jax.diagnosis.bench import Bench, Candidate
+from bayessim_jax.diagnosis.verdict import Entry
 from bayessim_jax.diagnosis.whiteness import difference_noise
-from bayessim_jax.inference.direct import fit_direct, noise_floor
+from bayessim_jax.inference.direct import estimate_noise, fit_direct, noise_floor
 from bayessim_jax.inference.replay import Inputs, Restarted
-from bayessim_jax.inference.shooting import Fit, Predict, Shots
+from bayessim_jax.inference.shooting import Fit, Predict, Shots, eliminate, normal_equations
 from bayessim_jax.recordings.shots import (
     REFINED,
     CaseModel,
@@ -40,7 +42,7 @@ from bayessim_jax.recordings.shots import (
 )
 from bayessim_jax.recordings.windows import Windows
 
-__all__ = ["Settled", "ratio_of_motion", "settle_step"]
+__all__ = ["Settled", "ratio_of_motion", "settle_answer", "settle_step"]
 
 TOLERABLE = 1.0
 """Of the noise: with a larger error of the time step the finer simulation is the one that is used."""
@@ -54,6 +56,9 @@ BLUR = 0.05
 """Of s as they tell it: standard deviation for what trapezoids leave of an integral."""
 PIECE, FEWEST = 0.15, 30
 """Seconds over which positions and velocities are compared, and how many such pieces it takes at least."""
+PASSES, STILL = 4, 0.1
+"""Times at most that the steps' effect is computed anew where a fit to recordings without it has ended, and of the
+standard deviation of s by how little it has to move for the last of them."""
 RATIO = normal(1 / 3, 1 / 3)
 """What is believed of s."""
 
@@ -95,6 +100,8 @@ class Settled:
     """The case's, and that of s."""
     error: Float[np.ndarray, "windows rows obs"]
     """What is uncertain of the time step's effect on predictions, a standard deviation in the channels' units."""
+    moved: tuple[float, float] = (RATIO.a, RATIO.b)
+    """s as positions and velocities tell it, mean and standard deviation (`ratio_of_motion`)."""
     told: bool = True
     """Whether positions and velocities tell s, or it does not matter; else the fit does, which takes it for physics."""
 
@@ -129,20 +136,26 @@ def settle_step(
     moved = ratio_of_motion(model, windows)
 
     def refit(base: CaseModel, predict: Predict, error: StepError, runs: np.ndarray) -> Settled:
-        calm = tame(runs, shots)
-        seen = _with_runs(shots, calm)
-        found = fit_direct(key, predict, seen, margins.size, start=fit, step=base.step, say=say)
-        ratio = float(RATIO.value(found.z[-1]))
+        found = fit
+        for turn in range(PASSES):
+            calm = tame(runs, shots)
+            seen = _with_runs(shots, calm)
+            found = fit_direct(key, predict, seen, margins.size, start=found, step=base.step, say=say)
+            ratio = float(RATIO.value(found.z[-1]))
+            here = dataclasses.replace(error, z=found.z[:-1]).runs(shots, base.refined, found.delta)
+            change, counts = _size(shots, found, interpolate(error.nodes, ratio, tame(here, shots) - calm))
+            if turn + 1 == PASSES or change * np.sqrt(counts) < INVISIBLE:
+                break
+            runs = here
         sd = RATIO.b * float(np.sqrt(np.linalg.inv(np.asarray(found.precision))[-1, -1]))
         less = moved[0] < ratio - BEYOND * np.hypot(sd, moved[1])
         if less or not -BEYOND * sd <= ratio <= 1.0 + BEYOND * sd:
             ratio, sd = moved
         ratio = float(np.clip(ratio, 0.0, 1.0))
-        ahead, behind = (interpolate(error.nodes, ratio + step, calm) for step in (1e-3, -1e-3))
-        wild = (calm == 0.0).all(1) * np.abs(runs).max(1)
+        wild = np.where(calm.any(1), 0.0, np.abs(runs).max(1))
         base = dataclasses.replace(base, step_error=dataclasses.replace(error, z=found.z[:-1], ratio=ratio))
-        uncertain = max(sd, SURE) * (ahead - behind) / 2e-3 + wild
-        return Settled(base, found, predict, seen, margins, uncertain, told=moved[1] < RATIO.b)
+        uncertain = max(sd, SURE) * _along(error.nodes, ratio, calm) + wild
+        return Settled(base, found, predict, seen, margins, uncertain, moved, told=moved[1] < RATIO.b)
 
     if size > TOLERABLE and not model.step:
         finest = case_model(model.case, engine=model.engine_name, before=model.before, refined=REFINED**2)
@@ -156,6 +169,80 @@ def settle_step(
             told = dataclasses.replace(again.model, remarks=(*again.model.remarks, remark))
             return dataclasses.replace(again, model=told)
     return refit(model, predict, error, runs)
+
+
+def settle_answer(
+    model: CaseModel, windows: Windows, bench: Bench, entries: Sequence[Entry], moved: tuple[float, float]
+) -> tuple[CaseModel, Bench]:
+    """What the time step does, computed anew with the first entry's effects and numbers, and s inferred with them.
+
+    A simulator without what is missing makes other errors, and finds another s. Each entry is fitted to what is left,
+    and what it says of its numbers is wide by what is not known of s, which positions and velocities bound, `moved`.
+    """
+    error, first = model.step_error, entries[0]
+    if error is None:
+        return model, bench
+    candidate, fit, ratio = first.candidate, first.fit, error.ratio
+    shots = dataclasses.replace(model, step_error=None).shots(windows)
+    floor = noise_floor(shots)
+
+    def settle(candidate: Candidate, fit: Fit) -> Fit:
+        sigma = estimate_noise(bench.shots, fit, floor, bench.used(candidate))
+        return bench.fit(candidate, fit.z, fit.delta, sigma, damping=fit.damping)
+
+    about = RATIO.a, RATIO.b
+    for _ in range(PASSES):
+        error = dataclasses.replace(error, z=fit.z[: bench.used(candidate)], ratio=ratio, answer=(bench, candidate))
+        calm = tame(error.runs(shots, model.refined, fit.delta), shots)
+        bench = bench.on(dataclasses.replace(shots, y=shots.y - interpolate(error.nodes, ratio, calm)))
+        fit, along = settle(candidate, fit), _along(error.nodes, ratio, calm)
+        mean, sd, wide = _infer_ratio(bench, candidate, fit, along, ratio, about)
+        if moved[0] < mean - BEYOND * np.hypot(sd, moved[1]):
+            about = moved
+            mean, sd, wide = _infer_ratio(bench, candidate, fit, along, ratio, about)
+        last, ratio = ratio, float(np.clip(mean, 0.0, 1.0))
+        if abs(ratio - last) < STILL * sd:
+            break
+    first.fit = wide
+    for entry in entries[1:]:
+        found = settle(entry.candidate, entry.fit)
+        entry.fit = _infer_ratio(bench, entry.candidate, found, along, ratio, about)[2]
+    return dataclasses.replace(model, step_error=error), bench
+
+
+def _infer_ratio(
+    bench: Bench,
+    candidate: Candidate,
+    fit: Fit,
+    along: Float[np.ndarray, "windows rows obs"],
+    ratio: float,
+    about: tuple[float, float],
+) -> tuple[float, float, Fit]:
+    """Mean and standard deviation of s, and the fit with what is not known of it: one Gauss-Newton step on (z, s).
+
+    `along` is how fast predictions change with s, `ratio` the s that was fitted with, `about` what is believed of it.
+    """
+    own, (mean, sd), k = bench.setup(candidate), about, fit.z.size
+    column = np.where(own.measured, along * sd / np.asarray(fit.sigma), 0.0).reshape(len(along), 1, -1)
+    slopes = jnp.asarray(np.insert(np.asarray(fit.slopes), [k], column, axis=1))
+    z = jnp.append(fit.z, (ratio - mean) / sd)
+    c = normal_equations(
+        fit.r.reshape(len(along), -1), slopes, z - jnp.append(own.center + 0.0 * fit.z, 0.0), fit.delta / own.spread
+    )
+    precision, gradient, _, shift = eliminate(c)
+    move = jnp.linalg.solve(precision, gradient)
+    pulls = c.pulls - jnp.einsum("wni,wn->wi", c.cross, shift)
+    wide = dataclasses.replace(fit, z=z, slopes=slopes, precision=precision, pulls=pulls).marginal(k)
+    width = float(jnp.sqrt(jnp.linalg.inv(precision)[k, k]))
+    return float(mean + sd * (z + move)[k]), sd * width, wide
+
+
+def _along(
+    nodes: Sequence[float], ratio: float, runs: Float[np.ndarray, "windows nodes rows obs"]
+) -> Float[np.ndarray, "windows rows obs"]:
+    """How fast predictions change with s."""
+    ahead, behind = (interpolate(nodes, ratio + step, runs) for step in (1e-3, -1e-3))
+    return (ahead - behind) / 2e-3
 
 
 def ratio_of_motion(model: CaseModel, windows: Windows) -> tuple[float, float]:

@@ -7,7 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from bayessim_jax.effects import EFFECTS
 from bayessim_jax.inference.direct import fit_direct
+from bayessim_jax.recordings.diagnosing import diagnose_case
+from bayessim_jax.recordings.evaluation import BEFORE
 from bayessim_jax.recordings.loading import load_case
 from bayessim_jax.recordings.shots import StepError, case_model, lagrange, predictor, split_windows
 from bayessim_jax.recordings.stepping import RATIO, ratio_of_motion, settle_step
@@ -123,3 +126,36 @@ def test_the_fit_of_some_parameters_is_the_margin_of_that_of_all(tmp_path):
     np.testing.assert_array_equal(one.along_states, fit.along_states)
     # where the second parameter is at its best, so is the first of the margin
     np.testing.assert_allclose(one.pulls.sum(0) - one.z, 0.0, atol=1e-3 * np.sqrt(float(one.precision[0, 0])))
+
+
+def test_what_steps_do_is_computed_where_the_fit_to_recordings_without_it_ends(tmp_path):
+    """A servo damps much within a step: where the masses of a first fit are a little off, so is the step."""
+    sealed = make_case(tmp_path / "case", "servo", finer=4, noise=0.3, recordings=6, seconds=3.0, seed=8000059)
+    model = case_model(load_case(tmp_path / "case").check())
+    settled = settle_step(jax.random.key(0), model, split_windows(model)[0])
+    assert settled.model.step_error.ratio == pytest.approx(1 / 16, abs=2e-3)
+    truth = np.asarray(model.margins.standard(jnp.array(list(sealed["parameters"].values()))))
+    sd = np.sqrt(np.diag(np.linalg.inv(np.asarray(settled.fit.precision))))[:-1]
+    assert (np.abs(np.asarray(settled.fit.z[:-1]) - truth) < 3 * sd).all()
+
+
+@pytest.fixture
+def coupled(tmp_path):
+    """A diagnosis of a cart whose pole drags it along more than the simulator knows, and the truth."""
+    sealed = make_case(tmp_path / "case", "cart", "joint_coupling", strength=0.5, finer=4, noise=0.3, seed=8000092)
+    model = case_model(load_case(tmp_path / "case").check(), before=BEFORE)
+    return diagnose_case(jax.random.key(0), model, effects=[EFFECTS["joint_coupling"]]), sealed
+
+
+def test_the_answer_finds_the_step_that_its_simulator_without_it_could_not(coupled):
+    found, sealed = coupled
+    assert found.result.verdict == "explained"
+    error = found.model.step_error
+    assert error.ratio == pytest.approx(1 / 16, abs=5e-3)
+    (mean, sd), truth = found.theta["augmented"], np.array(list(sealed["parameters"].values()))
+    assert (np.abs(mean - truth) < 3 * sd).all()
+    # with the simulator as it is at the same masses the error is another one
+    plain = dataclasses.replace(error, z=error.z[:2], answer=None)
+    shots = dataclasses.replace(found.model, step_error=None).shots(found.windows)
+    own, other = (e.offset(shots, found.model.refined) for e in (error, plain))
+    assert np.abs(own - other).max() > 0.05 * np.abs(own).max()
