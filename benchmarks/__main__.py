@@ -12,6 +12,14 @@ _MECHANISMS = ("pendulum", "cart-pole", "double pendulum", "3-joint arm", "6-joi
 _RIGS = ("pendulum", "swing", "pivot", "slide", "sled", "double", "chain", "servo", "cart", "arm3", "arm6")
 
 
+def _part(text: str) -> tuple[int, int]:
+    """`1/2` as numbers."""
+    part, _, parts = text.partition("/")
+    if not (part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts)):
+        raise argparse.ArgumentTypeError(f"{text!r} is not K/N with K from 1 to N")
+    return int(part), int(parts)
+
+
 def main() -> None:
     """Read the command line and run one benchmark."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
@@ -59,6 +67,9 @@ def main() -> None:
     )
     concealed.add_argument("--cases", type=int, default=200)
     concealed.add_argument("--seed", type=int, default=1)
+    concealed.add_argument(
+        "--part", type=_part, default=(1, 1), metavar="K/N", help="every Nth case from the Kth on; one core each"
+    )
     concealed.add_argument("--out", type=Path, help="file of JSON lines to append cases to, and to resume from")
     concealed.add_argument(
         "--records", type=Path, nargs="+", help="files of cases: print what became of one, or a table of several"

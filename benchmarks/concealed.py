@@ -249,7 +249,8 @@ def diagnose_concealed(options: Namespace) -> None:
         }
 
     rows = []
-    cases = draw_cases(options.rigs or list(MODELS), options.cases, options.seed)
+    first, parts = options.part
+    cases = draw_cases(options.rigs or list(MODELS), options.cases, options.seed)[first - 1 :: parts]
     for made in resumed(cases, options.out, make):
         row = made | judge(made["sealed"], made)
         rows.append(row)
