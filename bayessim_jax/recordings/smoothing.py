@@ -45,7 +45,7 @@ def smooth_recordings(
     dt = recordings[0].step
     noise = np.maximum(_noise(y, seen), 1e-9)
     usual = _usual_jerk(y, seen, dt, noise)
-    level = np.argmax([_filter(y, seen, dt, noise, level * usual)[0] for level in LEVELS], axis=0)
+    level = np.argmax(_filter(y, seen, dt, noise, LEVELS[:, None, None] * usual)[0], axis=0)
     smooth = _smooth(y, seen, dt, noise, LEVELS[level] * usual)
     out = [dataclasses.replace(r, qpos=r.qpos.copy(), qvel=r.qvel.copy()) for r in recordings]
     for s, (i, (start, stop)) in enumerate(spans):
@@ -102,10 +102,14 @@ def _start(y: np.ndarray, seen: np.ndarray, noise: np.ndarray) -> tuple[np.ndarr
 def _filter(
     y: np.ndarray, seen: np.ndarray, dt: float, noise: np.ndarray, jerk: np.ndarray, keep: bool = False
 ) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:
-    """Log likelihood of every joint, and means and covariances before and after every row."""
+    """Log likelihood of every joint, and means and covariances before and after every row.
+
+    `jerk` may be several ones of each joint, with axes (levels, 1, joints): all are filtered at once.
+    """
     f, q = _model(dt, jerk)
     x, p = _start(y, seen, noise)
-    total, kept = np.zeros(y.shape[1]), []
+    x, p = (np.broadcast_to(a, (*jerk.shape[:-2], *a.shape)) for a in (x, p))
+    total, kept = np.zeros((*jerk.shape[:-2], y.shape[1])), []
     for t in range(y.shape[2]):
         before = (x, p)
         for k in range(2):
@@ -114,7 +118,7 @@ def _filter(
             miss = np.where(used, y[:, :, t, k] - x[..., k], 0.0)
             if t >= WARM:
                 s = p[..., k, k] + noise[:, k] ** 2
-                total += np.where(used, -0.5 * (miss**2 / s + np.log(s)), 0.0).sum(0)
+                total += np.where(used, -0.5 * (miss**2 / s + np.log(s)), 0.0).sum(-2)
             x = x + gain * miss[..., None]
             p = np.where(used[..., None, None], p - gain[..., :, None] * p[..., None, k, :], p)
         if keep:

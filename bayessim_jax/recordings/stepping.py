@@ -17,6 +17,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -224,17 +225,22 @@ def _infer_ratio(
     """
     own, (mean, sd), k = bench.setup(candidate), about, fit.z.size
     column = np.where(own.measured, along * sd / np.asarray(fit.sigma), 0.0).reshape(len(along), 1, -1)
-    slopes = jnp.asarray(np.insert(np.asarray(fit.slopes), [k], column, axis=1))
-    z = jnp.append(fit.z, (ratio - mean) / sd)
-    c = normal_equations(
-        fit.r.reshape(len(along), -1), slopes, z - jnp.append(own.center + 0.0 * fit.z, 0.0), fit.delta / own.spread
-    )
-    precision, gradient, _, shift = eliminate(c)
-    move = jnp.linalg.solve(precision, gradient)
-    pulls = c.pulls - jnp.einsum("wni,wn->wi", c.cross, shift)
+    slopes = np.insert(np.asarray(fit.slopes), [k], column, axis=1)
+    z = np.append(np.asarray(fit.z), (ratio - mean) / sd)
+    r, scaled = np.asarray(fit.r).reshape(len(along), -1), np.asarray(fit.delta) / np.asarray(own.spread)
+    precision, pulls, move, width = _step_all(r, slopes, z, scaled)
     wide = dataclasses.replace(fit, z=z, slopes=slopes, precision=precision, pulls=pulls).marginal(k)
-    width = float(jnp.sqrt(jnp.linalg.inv(precision)[k, k]))
-    return float(mean + sd * (z + move)[k]), sd * width, wide
+    return float(mean + sd * (z[k] + move[k])), float(sd * width[k]), wide
+
+
+@jax.jit
+def _step_all(r: Array, slopes: Array, z: Array, scaled: Array) -> tuple[Array, Array, Array, Array]:
+    """Precision of all of z and every window's pull on it, a Gauss-Newton step, and its standard deviations."""
+    c = normal_equations(r, slopes, z, scaled)
+    precision, gradient, _, shift = eliminate(c)
+    covariance = jnp.linalg.inv(precision)
+    pulls = c.pulls - jnp.einsum("wni,wn->wi", c.cross, shift)
+    return precision, pulls, covariance @ gradient, jnp.sqrt(jnp.diagonal(covariance))
 
 
 def _along(
