@@ -112,7 +112,7 @@ def trace_once(
 def _kind(x: Any) -> tuple[Any, ...]:
     """What of an argument decides which program it belongs to."""
     if isinstance(x, np.ndarray):
-        return x.shape, x.dtype
+        return x.shape, x.dtype, False
     if isinstance(x, jax.Array):
         return x.shape, x.dtype, x.weak_type
     return np.shape(x), jax.dtypes.result_type(x), _is_weak(x)

@@ -23,7 +23,7 @@ def covariance_of(bench: Bench, entry: Entry) -> Float[np.ndarray, "k k"]:
     """
     d = bench.d
     size = d + len(bench.columns(entry.candidate))
-    covariance = np.asarray(robust_covariance(entry.fit))[:size, :size].copy()
+    covariance = robust_covariance(entry.fit)[:size, :size].copy()
     values = np.array(list(bench.values(entry.candidate, entry.fit.z).values()))
     form = np.array([bench.parameters[i].form for i in bench.columns(entry.candidate)])
     # no wider than the prior, whose standard deviation is 1

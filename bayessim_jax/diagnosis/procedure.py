@@ -911,7 +911,7 @@ def _enter(work: _Work, candidate: Candidate, fit: Fit, known: Float[np.ndarray,
     shared = jax.device_put(np.arange(spread.size) < bench.shots.spread.size)
     seen = (fit.r, fit.slopes, measured, fit.z, bench.free(candidate), fit.sigma)
     scores = cross_validate(*seen, work.floor, work.folds, fit.delta / spread, shared)
-    scores = np.nan_to_num(np.asarray(scores), nan=-1e12)
+    scores = np.nan_to_num(scores, nan=-1e12)
     misfit_key = jax.random.fold_in(work.key, crc32(" ".join(map(bench.label, candidate.effects)).encode()))
     judged = work.remembered if _recalls(bench, candidate, but_found=True) else None
     misfit = judge_misfit(misfit_key, fit.misses, fit.along_states, np.asarray(measured), known, judged)

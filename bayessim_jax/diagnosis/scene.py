@@ -166,7 +166,7 @@ class Scene(CandidatesOf):
         """Pairs that may explain much of what a fit leaves: no forces on a joint where any force would do little."""
         around, forcing, moved = self._force(candidate, p)
         seen = (around.lin, self._weigh(around, sigma), around.windowed, forcing, moved)
-        gains = np.asarray(bound_gains(*seen, p, delta, sigma, pieces=PIECES))
+        gains = bound_gains(*seen, p, delta, sigma, pieces=PIECES)
         # of noise alone: half of χ² with a degree of freedom for every piece
         noise = 0.5 * PIECES * len(delta)
         excess, sd = gains - noise, np.sqrt(noise)

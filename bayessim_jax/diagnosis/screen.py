@@ -215,7 +215,7 @@ class Screen:
                 moving = system if march.steps == 1 and cost > bad else free
                 at_work = march.here[2], march.damping, moving, self.bounded, self.shots.spread, *march.here[:2]
                 p, delta, promised = propose(*at_work)
-                march.tried, march.promised = (np.asarray(p), delta), float(np.nan_to_num(promised, nan=np.inf))
+                march.tried, march.promised = (p, delta), float(np.nan_to_num(promised, nan=np.inf))
 
     def settle(
         self,

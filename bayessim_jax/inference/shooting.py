@@ -138,10 +138,10 @@ class Fit:
         along = np.linalg.solve(precision[d:, d:], precision[d:, :d])
         return dataclasses.replace(
             self,
-            z=jnp.asarray(np.asarray(self.z)[:d]),
-            precision=jnp.asarray(precision[:d, :d] - precision[:d, d:] @ along),
-            pulls=jnp.asarray(pulls[:, :d] - pulls[:, d:] @ along),
-            slopes=jnp.asarray(np.delete(slopes, np.s_[d : len(precision)], axis=1)),
+            z=jax.device_put(np.asarray(self.z)[:d]),
+            precision=jax.device_put(precision[:d, :d] - precision[:d, d:] @ along),
+            pulls=jax.device_put(pulls[:, :d] - pulls[:, d:] @ along),
+            slopes=jax.device_put(np.delete(slopes, np.s_[d : len(precision)], axis=1)),
         )
 
     @property
@@ -349,8 +349,8 @@ def _arrive(march: _March, sigma: Array, terms: _Terms, shape: tuple[int, ...]) 
 
 
 _look = trace_once(expand, static_argnames=("predict", "step", "live"), compiler_options=COMPILER_OPTIONS)
-_go_on = jax.jit(_advance, compiler_options=COMPILER_OPTIONS)
-_end = jax.jit(_arrive, static_argnames="shape", compiler_options=COMPILER_OPTIONS)
+_go_on = trace_once(_advance, compiler_options=COMPILER_OPTIONS)
+_end = trace_once(_arrive, static_argnames="shape", compiler_options=COMPILER_OPTIONS)
 
 
 def solve(
@@ -397,7 +397,8 @@ def solve(
     return _end(march, noise, terms, shots.y.shape)
 
 
-def robust_covariance(fit: Fit) -> Float[Array, "d d"]:
+@partial(trace_once, to_numpy=True)
+def robust_covariance(fit: Fit) -> Float[np.ndarray, "d d"]:
     """Covariance of z where the model is only nearly right: Laplace's, wider where windows disagree more than noise.
 
     With H⁻¹ = L Lᵀ the windows' gradients g have Σ Lᵀ g gᵀ L = I on average if the model is right. Where an eigenvalue

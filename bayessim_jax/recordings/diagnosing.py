@@ -327,7 +327,7 @@ def _motion(model: CaseModel, windows: Windows, smooth: Windows) -> Motion:
     """The smoothed motion in windows, with their commands."""
     inputs = model.inputs(windows)
     return Motion(
-        jnp.asarray(smooth.qpos), jnp.asarray(smooth.qvel), inputs.ctrl, inputs.past, inputs.time, inputs.motion
+        jax.device_put(smooth.qpos), jax.device_put(smooth.qvel), inputs.ctrl, inputs.past, inputs.time, inputs.motion
     )
 
 

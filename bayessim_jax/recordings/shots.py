@@ -130,18 +130,18 @@ class CaseModel:
         """Windows as the solver takes them."""
         shots = Shots(
             inputs=self.inputs(windows),
-            y=jnp.asarray(self._stack(windows.qpos, windows.qvel, windows.sensors)),
-            measured=jnp.asarray(
+            y=jax.device_put(self._stack(windows.qpos, windows.qvel, windows.sensors)),
+            measured=jax.device_put(
                 self._stack(windows.qpos_measured, windows.qvel_measured, windows.sensors_measured).astype(bool)
                 & _rows(windows)[..., None]
             ),
-            spread=jnp.asarray(self._spread()),
-            bounded=jnp.asarray(self.margins.bounded),
+            spread=jax.device_put(self._spread()),
+            bounded=jax.device_put(self.margins.bounded),
         )
         if self.step_error is None:
             return shots
         return dataclasses.replace(
-            shots, y=jnp.asarray(np.asarray(shots.y) - self.step_error.offset(shots, self.refined))
+            shots, y=jax.device_put(np.asarray(shots.y) - self.step_error.offset(shots, self.refined))
         )
 
     def inputs(self, windows: Windows) -> Inputs:
@@ -161,8 +161,8 @@ class CaseModel:
                 places[w] = _coast(self, smooth.qpos[rows], rates[w] * early[:, None])
         place = windows.sensors[:, 0] if isinstance(self.system, Restarted) else windows.qpos[:, 0]
         first = (place, windows.qvel[:, 0], windows.ctrl, past, windows.start)
-        motion = (jnp.asarray(places), jnp.asarray(rates))
-        return Inputs(*map(jnp.asarray, first), motion=motion, unrecorded=jnp.asarray(unrecorded))
+        motion = (jax.device_put(places), jax.device_put(rates))
+        return Inputs(*map(jax.device_put, first), motion=motion, unrecorded=jax.device_put(unrecorded))
 
     def _stack(self, qpos: np.ndarray, qvel: np.ndarray, sensors: np.ndarray) -> np.ndarray:
         layout = self.case.layout

@@ -16,6 +16,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +32,7 @@ from bayessim_jax.diagnosis.whiteness import difference_noise
 from bayessim_jax.inference.direct import estimate_noise, fit_direct, noise_floor
 from bayessim_jax.inference.replay import Inputs, Restarted
 from bayessim_jax.inference.shooting import Fit, Predict, Shots, eliminate, normal_equations
+from bayessim_jax.programs import trace_once
 from bayessim_jax.recordings.shots import (
     REFINED,
     CaseModel,
@@ -233,7 +235,7 @@ def _infer_ratio(
     return float(mean + sd * (z[k] + move[k])), float(sd * width[k]), wide
 
 
-@jax.jit
+@partial(trace_once, to_numpy=True)
 def _step_all(r: Array, slopes: Array, z: Array, scaled: Array) -> tuple[Array, Array, Array, Array]:
     """Precision of all of z and every window's pull on it, a Gauss-Newton step, and its standard deviations."""
     c = normal_equations(r, slopes, z, scaled)
@@ -315,8 +317,8 @@ def _lead(
 
 def _with_runs(shots: Shots, runs: Float[np.ndarray, "windows nodes rows obs"]) -> Shots:
     """Windows beside what the time step does to them, of z with that of s, which has no ends."""
-    bounded = jnp.append(jnp.asarray(shots.bounded), False)
-    return dataclasses.replace(shots, inputs=Seen(shots.inputs, jnp.asarray(runs)), bounded=bounded)
+    bounded = jax.device_put(np.append(np.asarray(shots.bounded), False))
+    return dataclasses.replace(shots, inputs=Seen(shots.inputs, jax.device_put(runs)), bounded=bounded)
 
 
 def _size(shots: Shots, fit: Fit, error: Float[np.ndarray, "windows rows obs"]) -> tuple[float, int]:
