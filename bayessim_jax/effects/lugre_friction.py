@@ -5,12 +5,14 @@ from __future__ import annotations
 import jax.numpy as jnp
 import mujoco
 
-from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Scales, Values
+from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Past, Scales, Values
 from bayessim_jax.effects.places import joints
 
 __all__ = ["LuGreFriction"]
 
 TINY = 1e-12
+BENT = 0.9
+"""Of what bristles hold: as much as they are taken to be bent when a recording begins, at most."""
 
 
 class LuGreFriction(ForceEffect):
@@ -27,6 +29,7 @@ class LuGreFriction(ForceEffect):
     name = "lugre_friction"
     holds = True
     recalls = True
+    settles = False
 
     def places(self, model: mujoco.MjModel) -> list[str]:
         """Every hinge and slide."""
@@ -54,6 +57,16 @@ class LuGreFriction(ForceEffect):
         """Slipping with the motion, or bent by what the bristles hold."""
         level = _level(values, moment.velocity)
         return jnp.clip(moment.stop, -level, level)
+
+    def recall(self, values: Values, memory: Memory, past: Past, move: Number = 0.0) -> Memory:
+        """As far as a path that was recorded bends them.
+
+        What they were bent before is a guess: as much as now if nothing has moved since, and less the longer the path is.
+        """
+        moved = jnp.where(past.recorded, past.period * jnp.abs(past.velocities[:-1]), 0.0).sum()
+        level = _level(values, past.velocities[0]) + TINY
+        guess = BENT * jnp.clip(memory / level, -1.0, 1.0) * jnp.exp(-values["stiffness"] * moved / level)
+        return super().recall(values, level * jnp.tanh(jnp.arctanh(guess) + move), past)
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
         """What the bristles exert at the end of the time step."""

@@ -478,7 +478,7 @@ def _absorbed(problem: Problem, none: Entry) -> list[str]:
 
 
 def _beside(model: CaseModel, shots: Shots) -> Float[np.ndarray, "windows rows obs"] | float:
-    """What the time step does to predictions of the simulator without effects.
+    """What the time step does to predictions, of the answer if there is one.
 
     Where that is large, motion is so sensitive that in a simulator which moves otherwise it is something else.
     """

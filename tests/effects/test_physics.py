@@ -408,6 +408,18 @@ def test_what_a_spring_was_bent_before_a_recording_is_left_open():
     assert 0.2 * most < bent < 0.36 * most
 
 
+def test_what_bristles_were_bent_before_a_recording_is_left_open():
+    """Rest leaves all as it is, up to `move`; slipping over their reach leaves nothing of either."""
+    values = {"stiffness": 4.0, "damping": 0.1, "coulomb": 0.2, "static": 0.3, "velocity": 0.1}
+    still, recall = jnp.zeros(101), EFFECTS["lugre_friction"].recall
+    resting, slipping = past(0.01, still, still, still[1:]), past(0.01, still, still + 1.0, still[1:])
+    assert float(recall(values, 0.1, resting)) == pytest.approx(0.09)
+    assert float(recall(values, 0.1, resting, 9.0)) == pytest.approx(0.3, rel=1e-3)
+    assert float(recall(values, 0.1, resting, -9.0)) == pytest.approx(-0.3, rel=1e-3)
+    for move in (-1.0, 0.0, 1.0):
+        assert float(recall(values, 0.1, slipping, move)) == pytest.approx(0.2, rel=1e-3)
+
+
 @pytest.mark.parametrize("rows", [150, 158, 165, 180, 201])
 def test_a_motor_is_recalled_where_it_was_within_its_gap(rows):
     """Against the same motor in steps a hundred times as fine: pressed to either end, and on its way between them."""
