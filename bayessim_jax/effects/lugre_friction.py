@@ -61,7 +61,7 @@ class LuGreFriction(ForceEffect):
     def recall(self, values: Values, memory: Memory, past: Past, move: Number = 0.0) -> Memory:
         """As far as a path that was recorded bends them.
 
-        What they were bent before is a guess: as much as now if nothing has moved since, and less the longer the path is.
+        What they were bent before is a guess: as much as now if nothing has moved since, less the longer the path is.
         """
         moved = jnp.where(past.recorded, past.period * jnp.abs(past.velocities[:-1]), 0.0).sum()
         level = _level(values, past.velocities[0]) + TINY
