@@ -120,6 +120,8 @@ class Thresholds:
     """Times the error of predictions ahead of a candidate that another one has, which makes it shortsighted."""
     worth: float = 0.4
     """Share of what fewer effects leave, below which more effects are worth it."""
+    worth_ahead: float = 0.9
+    """The same of the error of predictions ahead, where fewer effects leave more than `rest_ahead` of it."""
     tie: float = 2.0
     """Standard errors within which two candidates predict held-out windows alike."""
     blur: float = 0.005
@@ -501,7 +503,12 @@ def is_worth(entry: Entry, entries: Sequence[Entry], none: Entry, thresholds: Th
 
 
 def _leaves_less(entry: Entry, part: Entry, none: Entry, thresholds: Thresholds) -> bool:
-    """Of the misfit of pieces, or, where the part leaves much of the error ahead, of both."""
+    """Of the misfit of pieces, or, where the part leaves much of the error ahead, of both; and less of that error.
+
+    What is found in short pieces alone bends to how they begin.
+    """
+    if part.ahead > thresholds.rest_ahead and entry.ahead > thresholds.worth_ahead * part.ahead:
+        return False
     mine, its = share_left(entry.misfit, none.misfit), share_left(part.misfit, none.misfit)
     both = part.ahead > thresholds.doubtful and mine * entry.ahead <= thresholds.worth * its * part.ahead
     return mine <= thresholds.worth * its or both

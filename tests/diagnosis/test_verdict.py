@@ -472,6 +472,23 @@ def test_a_set_that_wins_in_few_recordings_is_less_probable():
     assert 0.8 < found.probabilities[0] < 0.95
 
 
+@pytest.mark.parametrize(
+    ("part", "both", "wanted"),
+    [
+        (0.045, 0.051, ["a@x"]),  # it mends pieces, and nothing ahead
+        (0.045, 0.039, ["a@x", "b@x"]),
+        (0.015, 0.017, ["a@x", "b@x"]),  # too little is left ahead to tell
+        (0.045, np.nan, ["a@x", "b@x"]),
+    ],
+)
+def test_another_effect_has_to_tell_of_the_time_ahead(part, both, wanted):
+    alone = entry(["a@x"], 90.0, 0.004)
+    pair = entry(["a@x", "b@x"], 100.0, 0.0006, seed=1)
+    alone.ahead, pair.ahead = part, both
+    found = verdict(alone, pair)
+    assert found.verdict == "explained" and found.best.names == wanted
+
+
 def test_a_set_is_widened_only_where_it_is_worth_its_effects_and_is_not_enough():
     none = entry([], 0.0, 1.0)
     alone, other = entry(["a@x"], 100.0, 0.5), entry(["b@x"], 90.0, 0.6, seed=1)
