@@ -7,14 +7,13 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array
 
+from bayessim_jax.effects.bending import bent_before
 from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Past, Scales, Values
 from bayessim_jax.effects.places import joints
 
 __all__ = ["Hysteresis"]
 
 TINY = 1e-12
-BENT = 0.9
-"""Of what a spring can be bent by lasting motion: as much as it is taken to be when a recording begins, at most."""
 
 
 class Hysteresis(ForceEffect):
@@ -62,7 +61,7 @@ class Hysteresis(ForceEffect):
         mean = 0.5 * (past.velocities[1:] + past.velocities[:-1])
         moved = jnp.where(past.recorded, past.period * mean, 0.0).at[-1:].multiply(1.0 - past.h / past.period)
         most = _most(values)
-        guess = BENT * memory / most * jnp.exp(-values["A"] * jnp.abs(moved).sum() / most)
+        before = bent_before(memory, most, values["A"] * jnp.abs(moved).sum() / most, move)
 
         def bend(z: Array, dq: Array) -> Array:
             size = jnp.abs(z) + TINY
@@ -72,7 +71,7 @@ class Hysteresis(ForceEffect):
             middle = jnp.clip(z + 0.5 * bend(z, dq), -most, most)
             return jnp.clip(z + bend(middle, dq), -most, most), None
 
-        return jax.lax.scan(once, most * jnp.tanh(jnp.arctanh(guess) + move), moved)[0]
+        return jax.lax.scan(once, before, moved)[0]
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
         """What it exerts at the end of the time step."""

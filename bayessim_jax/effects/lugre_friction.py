@@ -5,14 +5,13 @@ from __future__ import annotations
 import jax.numpy as jnp
 import mujoco
 
+from bayessim_jax.effects.bending import bent_before
 from bayessim_jax.effects.contract import EffectParameter, ForceEffect, Memory, Moment, Number, Past, Scales, Values
 from bayessim_jax.effects.places import joints
 
 __all__ = ["LuGreFriction"]
 
 TINY = 1e-12
-BENT = 0.9
-"""Of what bristles hold: as much as they are taken to be bent when a recording begins, at most."""
 
 
 class LuGreFriction(ForceEffect):
@@ -65,8 +64,7 @@ class LuGreFriction(ForceEffect):
         """
         moved = jnp.where(past.recorded, past.period * jnp.abs(past.velocities[:-1]), 0.0).sum()
         level = _level(values, past.velocities[0]) + TINY
-        guess = BENT * jnp.clip(memory / level, -1.0, 1.0) * jnp.exp(-values["stiffness"] * moved / level)
-        return super().recall(values, level * jnp.tanh(jnp.arctanh(guess) + move), past)
+        return super().recall(values, bent_before(memory, level, values["stiffness"] * moved / level, move), past)
 
     def force(self, values: Values, memory: Memory, moment: Moment) -> tuple[Number, Memory]:
         """What the bristles exert at the end of the time step."""

@@ -397,7 +397,7 @@ def solve(
     return _end(march, noise, terms, shots.y.shape)
 
 
-@partial(trace_once, to_numpy=True)
+@trace_once(to_numpy=True)
 def robust_covariance(fit: Fit) -> Float[np.ndarray, "d d"]:
     """Covariance of z where the model is only nearly right: Laplace's, wider where windows disagree more than noise.
 

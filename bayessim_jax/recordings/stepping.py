@@ -16,7 +16,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -151,8 +150,7 @@ def settle_step(
                 break
             runs = here
         sd = RATIO.b * float(np.sqrt(np.linalg.inv(np.asarray(found.precision))[-1, -1]))
-        less = moved[0] < ratio - BEYOND * np.hypot(sd, moved[1])
-        if less or not -BEYOND * sd <= ratio <= 1.0 + BEYOND * sd:
+        if _is_shorter(moved, ratio, sd) or not -BEYOND * sd <= ratio <= 1.0 + BEYOND * sd:
             ratio, sd = moved
         ratio = float(np.clip(ratio, 0.0, 1.0))
         wild = np.where(calm.any(1), 0.0, np.abs(runs).max(1))
@@ -200,7 +198,7 @@ def settle_answer(
         bench = bench.on(dataclasses.replace(shots, y=shots.y - interpolate(error.nodes, ratio, calm)))
         fit, along = settle(candidate, fit), _along(error.nodes, ratio, calm)
         mean, sd, wide = _infer_ratio(bench, candidate, fit, along, ratio, about)
-        if moved[0] < mean - BEYOND * np.hypot(sd, moved[1]):
+        if _is_shorter(moved, mean, sd):
             about = moved
             mean, sd, wide = _infer_ratio(bench, candidate, fit, along, ratio, about)
         last, ratio = ratio, float(np.clip(mean, 0.0, 1.0))
@@ -211,6 +209,11 @@ def settle_answer(
         found = settle(entry.candidate, entry.fit)
         entry.fit = _infer_ratio(bench, entry.candidate, found, along, ratio, about)[2]
     return dataclasses.replace(model, step_error=error), bench
+
+
+def _is_shorter(moved: tuple[float, float], ratio: float, sd: float) -> bool:
+    """Whether positions and velocities tell of a shorter step than a fit, beyond doubt."""
+    return moved[0] < ratio - BEYOND * np.hypot(sd, moved[1])
 
 
 def _infer_ratio(
@@ -235,7 +238,7 @@ def _infer_ratio(
     return float(mean + sd * (z[k] + move[k])), float(sd * width[k]), wide
 
 
-@partial(trace_once, to_numpy=True)
+@trace_once(to_numpy=True)
 def _step_all(r: Array, slopes: Array, z: Array, scaled: Array) -> tuple[Array, Array, Array, Array]:
     """Precision of all of z and every window's pull on it, a Gauss-Newton step, and its standard deviations."""
     c = normal_equations(r, slopes, z, scaled)
