@@ -304,8 +304,14 @@ class Bench:
         start: Float[np.ndarray, " n"],
         here: Float[np.ndarray, "windows rows obs"],
     ) -> Float[np.ndarray, "windows rows obs"]:
-        """Variance of predictions `here` where every part of the initial states is off by so much."""
-        moved = (self.replay(candidate, x, shots, jnp.asarray(move)) for move in np.diag(start))
+        """Variance of predictions `here` where every part of the recorded initial states is off by so much.
+
+        What effects remember beside these is theirs to say: not to know it is no excuse for what they predict.
+        """
+        recorded = self.shots.spread.size
+        beside = np.zeros((recorded, len(start) - recorded))
+        moves = np.hstack([np.diag(start[:recorded]), beside])
+        moved = (self.replay(candidate, x, shots, jnp.asarray(move)) for move in moves)
         return sum(((y - here) ** 2 for y in moved), np.zeros_like(here))
 
 

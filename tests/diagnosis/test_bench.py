@@ -189,6 +189,20 @@ def test_no_candidate_is_the_simulator_as_it_is(problem):
     np.testing.assert_allclose(predicted(bench, Candidate(), x), plain, atol=1e-10)
 
 
+def test_what_an_effect_remembers_unseen_is_no_excuse_for_what_it_predicts(problem):
+    """A free force in every window explains pieces of any slow push; of the time ahead it has to say something."""
+    bench = problem.bench([(EFFECTS["hysteresis"], "joint/hinge")])
+    bent = Candidate((0,))
+    x = bench.starts(bent, jnp.array([0.3]))[-1]
+    here = bench.replay(bent, x, bench.shots)
+    moved = bench.replay(bent, x, bench.shots, jnp.array([0.0, 0.0, 1.0]))
+    assert np.abs(moved - here).max() > 1e-3
+    assert (bench.scatter(bent, x, bench.shots, np.array([0.0, 0.0, 1.0]), here) == 0.0).all()
+    tilted = bench.replay(bent, x, bench.shots, jnp.array([0.01, 0.0, 0.0]))
+    found = bench.scatter(bent, x, bench.shots, np.array([0.01, 0.0, 1.0]), here)
+    np.testing.assert_allclose(found, (tilted - here) ** 2, atol=1e-15)
+
+
 def test_a_candidate_has_its_own_parameters_in_physical_units(problem):
     bench = problem.bench(problem.pairs)
     stribeck = Candidate((1,))
