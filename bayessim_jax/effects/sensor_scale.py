@@ -24,8 +24,8 @@ class SensorScale(SenseEffect):
         return encoders(model)
 
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
-        """The scale k."""
-        return (EffectParameter("scale", "", 0.5, 2.0, 1.0, 1.05, scan=5),)
+        """The scale k: edges counted once or four times, or another gear, are factors."""
+        return (EffectParameter("scale", "", 0.125, 8.0, 1.0, 1.05, log=True, scan=7),)
 
     def sense(self, values: Values, memory: Memory, reading: Scalar, moment: Moment) -> Scalar:
         """The product k q."""
