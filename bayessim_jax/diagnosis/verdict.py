@@ -32,6 +32,7 @@ __all__ = [
     "find_shortsighted",
     "has_special_case",
     "is_outdone",
+    "is_refuted",
     "is_worse",
     "is_worth",
     "leaves_much",
@@ -104,6 +105,8 @@ class Thresholds:
     """Share of the baseline's error of predictions ahead, below which what pieces leave is the sensors' own."""
     chief: float = 0.03
     """The same for one effect by which all but a rest is foreseen, that no set of candidates explains."""
+    slight: float = 0.01
+    """Error on recordings left out, as `nrmse`, up to which there is no more than a rest beside that effect."""
     enough: float = 0.015
     """Share that effects may leave before larger sets are tried."""
     rest: float = 0.002
@@ -413,6 +416,29 @@ def _find_chief(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -
         return []
     tied = [entry for entry in alone if ties(entry, alone[0], none, thresholds)]
     return tied if all(e.ahead <= thresholds.chief and e.misfit.judged.all() for e in tied) else []
+
+
+def is_refuted(
+    judging: Mapping[str, Errors],
+    floor: float,
+    scale: Float[np.ndarray, " obs"],
+    thresholds: Thresholds,
+    beside_a_rest: bool,
+) -> bool:
+    """Whether recordings left out contradict an answer.
+
+    Where it is one `beside_a_rest`, that has to be slight, and a force without a name must not find it to be forces.
+    """
+    baseline, answer, flexible = judging["baseline"], judging["augmented"], judging.get("flexible")
+    if falls_short(baseline, answer, scale, floor, thresholds) or is_worse(baseline, answer, scale):
+        return True
+    if beside_a_rest and nrmse(answer, scale) > thresholds.slight:
+        return True
+    if flexible is None:
+        return False
+    if beside_a_rest and predicts_more(flexible, answer, scale):
+        return True
+    return is_outdone(baseline, answer, flexible, scale, thresholds)
 
 
 def is_outdone(

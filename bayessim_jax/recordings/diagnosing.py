@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -28,15 +28,12 @@ from bayessim_jax.diagnosis.verdict import (
     Entry,
     Thresholds,
     error_of_sum,
-    falls_short,
-    is_outdone,
-    is_worse,
-    predicts_more,
+    is_refuted,
     share_left,
 )
 from bayessim_jax.effects import EFFECTS, Scales, commanded_scales, effect_places, open_form, recorded_scales
 from bayessim_jax.inference.replay import Restarted
-from bayessim_jax.inference.scores import Errors, Score, compare, error_spread, score
+from bayessim_jax.inference.scores import Score, compare, error_spread, score
 from bayessim_jax.inference.shooting import Shots
 from bayessim_jax.recordings.experiments import advise, next_experiment
 from bayessim_jax.recordings.identification import channel_scale, start_spread
@@ -395,7 +392,7 @@ def diagnose_case(
     floor = _floor(variance, scale, shots)
     if result.confusion:
         excused = _floor(variance + np.square(_beside(model, shots)), scale, shots)
-        if _is_refuted(judging, excused, scale, thresholds, result.beside_a_rest):
+        if is_refuted(judging, excused, scale, thresholds, result.beside_a_rest):
             result.take_back()
     named = result.verdict != "no_mismatch"
     return CaseDiagnosis(
@@ -452,23 +449,6 @@ def _explain(
             return taken, result, fitting.result()
     say("the time step of what was recorded is another one, by what was found: once more with it")
     return _explain(key, again, thresholds, say)
-
-
-def _is_refuted(
-    judging: Mapping[str, Errors], floor: float, scale: np.ndarray, thresholds: Thresholds, beside_a_rest: bool
-) -> bool:
-    """Whether recordings left out contradict an answer.
-
-    Where it is one `beside_a_rest`, a force without a name must not find that rest to be forces.
-    """
-    baseline, answer, flexible = judging["baseline"], judging["augmented"], judging.get("flexible")
-    if falls_short(baseline, answer, scale, floor, thresholds) or is_worse(baseline, answer, scale):
-        return True
-    if flexible is None:
-        return False
-    if beside_a_rest and predicts_more(flexible, answer, scale):
-        return True
-    return is_outdone(baseline, answer, flexible, scale, thresholds)
 
 
 def _absorbed(problem: Problem, none: Entry) -> list[str]:

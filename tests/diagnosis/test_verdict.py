@@ -14,6 +14,7 @@ from bayessim_jax.diagnosis.verdict import (
     falls_short,
     find_shortsighted,
     is_outdone,
+    is_refuted,
     is_worse,
     may_be_named,
     predicts_more,
@@ -150,6 +151,17 @@ def test_an_answer_that_predicts_worse_than_without_it_is_worse(answer, wanted):
     baseline = uniform_errors(0.1)
     errors = Errors(np.broadcast_to(np.array(answer)[:, None, None], baseline.error.shape), baseline.measured)
     assert is_worse(baseline, errors, np.ones(2)) == wanted
+
+
+@pytest.mark.parametrize(
+    ("answer", "flexible", "wanted"),
+    [(0.004, 0.006, False), (0.0155, 0.0185, True), (0.004, 0.003, True), (0.004, np.nan, False)],
+)
+def test_what_is_named_beside_a_rest_leaves_a_slight_one_that_is_no_force(answer, flexible, wanted):
+    sizes = {"baseline": 0.1, "augmented": answer, "flexible": flexible}
+    judging = {name: uniform_errors(size) for name, size in sizes.items()}
+    assert is_refuted(judging, 0.002, np.ones(2), Thresholds(), beside_a_rest=True) == wanted
+    assert not is_refuted(judging, 0.01, np.ones(2), Thresholds(), beside_a_rest=False)
 
 
 def uniform_errors(size, windows=8):
