@@ -222,6 +222,10 @@ class Bench:
         kinds = tuple(self.each[i] for i in self.columns(candidate))
         return Simulator(self.system, self.margins, pairs, self.scales, kinds)
 
+    def unsettled(self, candidate: Candidate) -> int:
+        """Of a candidate's effects, how many remember what no state tells."""
+        return sum(not getattr(self.pairs[k][0], "settles", True) for k in candidate.effects)
+
     def setup(self, candidate: Candidate, shots: Shots | None = None) -> Shots:
         """The windows (or others) as a candidate's simulator takes them.
 
@@ -229,7 +233,7 @@ class Bench:
         have a number more for each.
         """
         every = self.shots if shots is None else shots
-        unsettled = sum(not getattr(self.pairs[k][0], "settles", True) for k in candidate.effects)
+        unsettled = self.unsettled(candidate)
         if unsettled:
             every = dataclasses.replace(every, spread=jnp.concatenate([every.spread, jnp.ones(unsettled)]))
         own = [self.each[i] for i in self.columns(candidate)]
@@ -304,13 +308,8 @@ class Bench:
         start: Float[np.ndarray, " n"],
         here: Float[np.ndarray, "windows rows obs"],
     ) -> Float[np.ndarray, "windows rows obs"]:
-        """Variance of predictions `here` where every part of the recorded initial states is off by so much.
-
-        What effects remember beside these is theirs to say: not to know it is no excuse for what they predict.
-        """
-        recorded = self.shots.spread.size
-        beside = np.zeros((recorded, len(start) - recorded))
-        moves = np.hstack([np.diag(start[:recorded]), beside])
+        """Variance of predictions `here` where every part of the initial states is off by so much."""
+        moves = np.diag(start)[np.flatnonzero(start)]
         moved = (self.replay(candidate, x, shots, jnp.asarray(move)) for move in moves)
         return sum(((y - here) ** 2 for y in moved), np.zeros_like(here))
 

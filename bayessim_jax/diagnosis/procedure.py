@@ -37,6 +37,7 @@ from bayessim_jax.diagnosis.verdict import (
     find_shortsighted,
     has_special_case,
     is_worth,
+    may_be_astray,
     may_be_named,
     most_left,
     share_left,
@@ -871,7 +872,7 @@ def _look_ahead(
     for _ in range(TURNS):
         left = [entry for entry in entries if entry not in gone]
         _foresee(bench, none, [e for e in left if may_be_named(e, left, none, thresholds)], ahead)
-        if not left[0].ahead > thresholds.lacking:
+        if not (left[0].ahead > thresholds.lacking or may_be_astray(left[0], thresholds)):
             break
         unseen = [e for e in left if np.isnan(e.ahead) and share_left(e.misfit, none.misfit) <= thresholds.left]
         _foresee(bench, none, [left[0], *unseen[:RIVALS]], ahead)
@@ -885,16 +886,22 @@ def _look_ahead(
 def _foresee(bench: Bench, none: Entry, entries: Sequence[Entry], ahead: Shots) -> None:
     """Predict long windows with candidates of which the first is the best.
 
-    Initial states are off by what the best candidate's fit moved them.
+    Initial states are off by what the best candidate's fit moved them. With them goes what it remembers unseen, unless
+    that excuses all that is missed: then it is no excuse.
     """
     best, remembered = entries[0], _remembered(bench, ahead)
     there = ahead.measured if remembered is None else ahead.measured & remembered[:, None, None]
     with ThreadPoolExecutor(WORKERS) as pool:
         base, *predicted = pool.map(lambda e: bench.replay(e.candidate, e.fit.z, ahead), [none, *entries])
-    spread = np.nan_to_num(bench.scatter(best.candidate, best.fit.z, ahead, best.fit.usual_move, predicted[0]))
+    usual = best.fit.usual_move
+    recorded = np.where(np.arange(len(usual)) < bench.shots.spread.size, usual, 0.0)
+    moves = [usual, recorded] if (recorded != usual).any() else [usual]
+    spreads = [np.nan_to_num(bench.scatter(best.candidate, best.fit.z, ahead, m, predicted[0])) for m in moves]
     for entry, here in zip(entries, predicted, strict=True):
         known = dataclasses.replace(ahead, measured=there) if _recalls(bench, entry.candidate) else ahead
-        entry.ahead = error_left(known, here, base, entry.misfit.noise, spread)
+        left = [error_left(known, here, base, entry.misfit.noise, spread) for spread in spreads]
+        entry.ahead = left[0] if not np.isnan(left[0]) else left[-1]
+        entry.unexcused = error_left(known, here, base, entry.misfit.noise, whole=True)
 
 
 def _folds(group: Int[np.ndarray, " windows"]) -> Bool[Array, "folds windows"]:
@@ -917,7 +924,8 @@ def _enter(work: _Work, candidate: Candidate, fit: Fit, known: Float[np.ndarray,
     misfit = judge_misfit(misfit_key, fit.misses, fit.along_states, np.asarray(measured), known, judged)
     share, seats = _log_share(bench, candidate, fit), bench.seats(candidate)
     told = bench.told(candidate, fit.z)
-    return Entry(candidate, told, [bench.name(k) for k in told], fit, scores, misfit, log_share=share, seats=seats)
+    names, guesses = [bench.name(k) for k in told], bench.unsettled(candidate) > 0
+    return Entry(candidate, told, names, fit, scores, misfit, log_share=share, seats=seats, guesses=guesses)
 
 
 def _log_share(bench: Bench, candidate: Candidate, fit: Fit) -> float:

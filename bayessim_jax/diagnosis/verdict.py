@@ -36,6 +36,7 @@ __all__ = [
     "is_worse",
     "is_worth",
     "leaves_much",
+    "may_be_astray",
     "may_be_named",
     "most_left",
     "predicts_more",
@@ -79,6 +80,8 @@ VISIBLE = 0.5
 """Error of predictions over what cannot be predicted, from which a share of it says something."""
 CHAOTIC = 0.5
 """Share of a channel's error beyond noise that noise in the initial states may make for it to say something."""
+LARGE = 1e6
+"""Most that an error of predictions ahead counts, over the noise, squared; what is not finite counts as much."""
 SEVERAL = 4
 """Windows left out, from which one of them alone takes no answer away."""
 BOOTSTRAPS, FEW = 1000, 6
@@ -165,6 +168,10 @@ class Entry:
 
     Known of candidates that may be named.
     """
+    unexcused: float = float("nan")
+    """The same of the whole error, nothing excused."""
+    guesses: bool = False
+    """Whether fits find, window by window, what one of its effects remembers unseen."""
     log_share: float = 0.0
     """Log of the share of its prior that the candidate's numbers are found in: the evidence over the best likelihood.
 
@@ -246,16 +253,16 @@ def error_left(
     base: Float[np.ndarray, "windows rows obs"],
     noise: Float[np.ndarray, " obs"],
     spread: Float[np.ndarray, "windows rows obs"] | float = 0.0,
+    whole: bool = False,
 ) -> float:
     """Share of the error of one prediction of windows that another one still has, beyond what cannot be predicted.
 
     That is the sensors' noise and, by their noise in the initial states, `spread`, a variance. A channel in which that
     spread makes up for most of what the second prediction errs beyond noise tells nothing. A window in which the first
     errs more than the second, because motion there is chaotic, counts as not improved. NaN where the second errs hardly
-    more than cannot be predicted.
+    more than cannot be predicted. An error of more than a thousand times the noise counts as that, unless `whole`.
     """
-    measured, y = np.asarray(shots.measured), np.asarray(shots.y)
-    large = 1e6
+    measured, y, large = np.asarray(shots.measured), np.asarray(shots.y), LARGE
 
     def total(squares: np.ndarray, there: np.ndarray, axes: tuple[int, int]) -> np.ndarray:
         finite = np.nan_to_num(squares, nan=large, posinf=large)
@@ -263,6 +270,8 @@ def error_left(
 
     by_chance = np.broadcast_to(spread / noise**2, y.shape)
     missed, was_missed = (((y - p) / noise) ** 2 for p in (predicted, base))
+    if whole:
+        large = max(large, np.nanmax(np.where(measured & np.isfinite(was_missed), was_missed, 0.0)))
     chance, wrong = (total(squares, measured, (0, 1)) for squares in (by_chance, was_missed - 1.0))
     told = measured & (chance <= CHAOTIC * wrong)
     own, was, noisy = (total(squares, told, (1, 2)) for squares in (missed, was_missed, 1.0 + by_chance))
@@ -501,15 +510,26 @@ def falls_short(
 def find_shortsighted(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> list[Entry]:
     """Candidates that predict far ahead much worse than another one with as few effects that explains pieces, too.
 
-    What bends to what short pieces show, whatever makes it, is found out by what it says of the time after.
+    What bends to what short pieces show, whatever makes it, is found out by what it says of the time after. Nor is what
+    an effect remembers unseen, found window by window, an excuse where another one needs none.
     """
     sound = [entry for entry in entries if share_left(entry.misfit, none.misfit) <= thresholds.left]
-    return [
-        entry
-        for entry in entries
-        if entry.ahead > thresholds.lacking
-        and any(o.ahead <= thresholds.farther * entry.ahead and len(o.names) <= len(entry.names) for o in sound)
-    ]
+
+    def is_outseen(entry: Entry) -> bool:
+        rivals = [o for o in sound if len(o.names) <= len(entry.names)]
+        if entry.ahead > thresholds.lacking and any(o.ahead <= thresholds.farther * entry.ahead for o in rivals):
+            return True
+        known = [o for o in rivals if not o.guesses]
+        return may_be_astray(entry, thresholds) and any(
+            o.unexcused <= thresholds.farther * entry.unexcused for o in known
+        )
+
+    return [entry for entry in entries if is_outseen(entry)]
+
+
+def may_be_astray(entry: Entry, thresholds: Thresholds) -> bool:
+    """Whether what a candidate guesses of every window leaves much of the time ahead."""
+    return entry.guesses and entry.unexcused > thresholds.rest_ahead
 
 
 def _suffices(entry: Entry, tied: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:

@@ -108,7 +108,10 @@ class CaseInference:
 
 
 def start_spread(model: CaseModel, fit: Fit) -> Float[np.ndarray, " n"]:
-    """How far recorded initial states are off: their own noise where they were measured, else what the fit found."""
+    """How far recorded initial states are off: their own noise where they were measured, else what the fit found.
+
+    Nothing of what effects remember beside them: not to know that is no excuse for what they predict.
+    """
     found = fit.usual_move
     if isinstance(model.system, Restarted):
         size = model.system.observations.size
@@ -117,6 +120,7 @@ def start_spread(model: CaseModel, fit: Fit) -> Float[np.ndarray, " n"]:
     joints, nv = model.case.layout.single, model.system.engine.model.nv
     sigma = dict(zip(model.channels, np.asarray(fit.sigma), strict=True))
     names = {v: (f"joint/{name}/qpos", f"joint/{name}/qvel") for name, _, v in joints}
+    found[2 * nv :] = 0.0
     for v, (place, rate) in names.items():
         if place in sigma:
             found[v] = sigma[place]

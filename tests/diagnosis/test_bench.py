@@ -12,6 +12,7 @@ from bayessim_jax.diagnosis.bench import Candidate, margin_of_effect
 from bayessim_jax.diagnosis.procedure import (
     Problem,
     _folds,
+    _foresee,
     _log_share,
     _stand_ins,
     _turn,
@@ -21,6 +22,7 @@ from bayessim_jax.diagnosis.procedure import (
 )
 from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.diagnosis.screen import Begun
+from bayessim_jax.diagnosis.verdict import error_left
 from bayessim_jax.effects import EFFECTS, EffectParameter, Scales
 from bayessim_jax.inference.direct import estimate_noise
 from bayessim_jax.inference.replay import replay_window
@@ -189,18 +191,18 @@ def test_no_candidate_is_the_simulator_as_it_is(problem):
     np.testing.assert_allclose(predicted(bench, Candidate(), x), plain, atol=1e-10)
 
 
-def test_what_an_effect_remembers_unseen_is_no_excuse_for_what_it_predicts(problem):
+@pytest.mark.parametrize("excused", [True, False])
+def test_what_an_effect_remembers_unseen_excuses_no_more_than_is_missed(problem, excused):
     """A free force in every window explains pieces of any slow push; of the time ahead it has to say something."""
     bench = problem.bench([(EFFECTS["hysteresis"], "joint/hinge")])
-    bent = Candidate((0,))
-    x = bench.starts(bent, jnp.array([0.3]))[-1]
-    here = bench.replay(bent, x, bench.shots)
-    moved = bench.replay(bent, x, bench.shots, jnp.array([0.0, 0.0, 1.0]))
-    assert np.abs(moved - here).max() > 1e-3
-    assert (bench.scatter(bent, x, bench.shots, np.array([0.0, 0.0, 1.0]), here) == 0.0).all()
-    tilted = bench.replay(bent, x, bench.shots, jnp.array([0.01, 0.0, 0.0]))
-    found = bench.scatter(bent, x, bench.shots, np.array([0.01, 0.0, 1.0]), here)
-    np.testing.assert_allclose(found, (tilted - here) ** 2, atol=1e-15)
+    bent, plain = Candidate((0,)), Candidate()
+    x, theta = bench.starts(bent, jnp.array([0.3]))[-1], bench.starts(plain, jnp.array([0.3]))[0]
+    here, base = bench.replay(bent, x, problem.shots), bench.replay(plain, theta, problem.shots)
+    fit = SimpleNamespace(z=x, usual_move=np.array([0.0, 0.0, 1e3 if excused else 1e-9]))
+    misfit = SimpleNamespace(noise=np.full(here.shape[-1], 1e-4))
+    entry = SimpleNamespace(candidate=bent, fit=fit, misfit=misfit, ahead=np.nan)
+    _foresee(bench, SimpleNamespace(candidate=plain, fit=SimpleNamespace(z=theta)), [entry], problem.shots)
+    assert entry.ahead == pytest.approx(error_left(problem.shots, here, base, misfit.noise), rel=1e-3)
 
 
 def test_a_candidate_has_its_own_parameters_in_physical_units(problem):

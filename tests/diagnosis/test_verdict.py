@@ -154,6 +154,21 @@ def test_an_answer_that_predicts_worse_than_without_it_is_worse(answer, wanted):
 
 
 @pytest.mark.parametrize(
+    ("unexcused", "rival", "guesses", "gone"),
+    [
+        (0.04, 0.001, True, True),
+        (0.04, 0.001, False, False),  # what it remembers, the state tells
+        (0.04, 0.02, True, False),  # not ten times better
+        (0.01, 0.0001, True, False),  # good enough
+    ],
+)
+def test_what_guesses_its_memory_window_by_window_gives_way_to_what_needs_none(unexcused, rival, guesses, gone):
+    best, other = entry(["hysteresis@x"], 100.0, 0.002), entry(["b@x"], 90.0, 0.01, seed=1)
+    best.ahead, best.unexcused, best.guesses, other.unexcused = 0.001, unexcused, guesses, rival
+    assert find_shortsighted([best, other], entry([], 0.0, 1.0), Thresholds()) == ([best] if gone else [])
+
+
+@pytest.mark.parametrize(
     ("answer", "flexible", "wanted"),
     [(0.004, 0.006, False), (0.0155, 0.0185, True), (0.004, 0.003, True), (0.004, np.nan, False)],
 )
@@ -313,6 +328,17 @@ def test_what_noise_in_initial_states_costs_ahead_is_no_error_of_a_candidate():
     assert error_left(shots, right, base, noise, spread) < 0.01
     assert error_left(shots, base, base, noise, spread) == pytest.approx(1.0)
     assert np.isnan(error_left(shots, right, right, noise, spread))
+
+
+def test_an_error_of_any_size_against_the_noise_is_counted_whole_where_it_is_asked():
+    """The encoder of a rail shows 0.3 μm, and a simulator is 10 mm off: a billion times the noise, squared."""
+    shape = (20, 50, 1)
+    shots = Shots(None, np.zeros(shape), np.ones(shape, bool), np.ones(1))
+    base, noise = np.full(shape, 1e-2), np.full(1, 3e-7)
+    assert error_left(shots, 0.1 * base, base, noise, whole=True) == pytest.approx(0.01, rel=1e-3)
+    assert error_left(shots, 0.1 * base, base, noise) == pytest.approx(1.0)
+    lost = np.where(np.arange(20)[:, None, None] < 5, np.nan, 0.1 * base)
+    assert error_left(shots, lost, base, noise, whole=True) == pytest.approx(0.25 + 0.75 * 0.01, rel=1e-3)
 
 
 def test_what_chaos_excuses_in_one_window_excuses_nothing_in_another():
