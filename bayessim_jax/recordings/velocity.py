@@ -18,6 +18,9 @@ GROWTH = 1.1
 """How much more variance a wider fit may leave than the narrowest, before it is taken to smooth motion away."""
 LONGEST = 0.1
 """Longest half width of a fit that is more than the least, s."""
+BENT, CLEAN = 20.0, 0.25
+"""Times the usual variance around a fit, from which the motion bends within it, and share of that which a fit to one
+side leaves where it does not bend there."""
 
 
 def estimate_slopes(
@@ -27,17 +30,34 @@ def estimate_slopes(
 
     A parabola is fitted to the rows around each one, at their own times and never across a break (`breaks[t]` lies
     between rows t and t + 1); its slope there is the velocity. A row alone between breaks has none: NaN. Against a
-    bare difference the noise falls with the 1.5th power of the width.
+    bare difference the noise falls with the 1.5th power of the width. Where the motion bends among these rows,
+    because a command jumps or something hits, those before or after the bend tell the velocity.
 
-    Source: Savitzky and Golay 1964
+    Source: Savitzky and Golay 1964; Nagao and Matsuyama 1979 (the choice of a side, by what it leaves)
     """
     run = np.concatenate([[0], np.cumsum(breaks)])
     half = choose_half_width(time, values, run)
-    slopes = np.empty(len(time))
-    for start in range(0, len(time), CHUNK):
-        stop = min(start + CHUNK, len(time))
-        slopes[start:stop] = local_quadratic(time, values, run, start, stop, half)[0]
+    slopes, left = _fit_all(time, values, run, half, 0)
+    some = left[(left > 0.0) & np.isfinite(left)]
+    bent = left > BENT * (np.median(some) if some.size else 0.0)
+    if bent.any():
+        least = np.where(bent, CLEAN * left, 0.0)
+        for side in (-half, half):
+            other, its = _fit_all(time, values, run, half, side)
+            slopes, least = np.where(its < least, other, slopes), np.minimum(its, least)
     return slopes, half
+
+
+def _fit_all(
+    time: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows"], run: np.ndarray, half: int, shift: int
+) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
+    """Slope at every row, and the variance around the fit; infinite where it passes through all of its rows."""
+    slopes, left = np.empty(len(time)), np.empty(len(time))
+    for start in range(0, len(time), CHUNK):
+        part = slice(start, min(start + CHUNK, len(time)))
+        slopes[part], squares, count = local_quadratic(time, values, run, part.start, part.stop, half, shift)
+        left[part] = np.where(count > 3, squares / np.maximum(count - 3, 1), np.inf)
+    return slopes, left
 
 
 def choose_half_width(time: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows"], run: np.ndarray) -> int:
@@ -73,16 +93,17 @@ def local_quadratic(
     start: int,
     stop: int,
     half: int,
+    shift: int = 0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Slope, sum of squared residuals and number of rows of the fits around rows `start` to `stop`.
+    """Slope, sum of squared residuals and number of rows of the fits around rows `start` to `stop`, or beside these.
 
-    At the ends of a run the fit is that of the nearest row that has `half` rows to each side.
-    Times are taken from the row itself and in units of the mean step, values from the row's own, so that epoch times
-    lose no digits.
+    A fit is around the row that comes so many after, `shift`, and its slope is that at the row itself. At the ends of a
+    run the fit is that of the nearest row that has `half` rows to each side. Times are taken from the row itself
+    and in units of the mean step, values from the row's own, so that epoch times lose no digits.
     """
     here = np.arange(start, stop)
     first, last = np.searchsorted(run, run[here], "left"), np.searchsorted(run, run[here], "right") - 1
-    centre = np.where(last - first > 2 * half, np.clip(here, first + half, last - half), (first + last) // 2)
+    centre = np.where(last - first > 2 * half, np.clip(here + shift, first + half, last - half), (first + last) // 2)
     unit = max((time[stop - 1] - time[start]) / max(stop - start - 1, 1), 1e-12)
     s = np.zeros((5, stop - start))
     b = np.zeros((3, stop - start))

@@ -55,6 +55,32 @@ def test_what_is_not_noisy_is_hardly_smoothed():
     np.testing.assert_allclose(slopes[2:-2], 6 * np.cos(6 * time[2:-2]), atol=0.01)
 
 
+def test_where_an_acceleration_jumps_the_rows_of_one_side_tell_the_velocity():
+    rng, dt = np.random.default_rng(3), 0.01
+    acceleration = np.repeat(rng.uniform(-100.0, 100.0, 25), 40)
+    truth = np.concatenate([[0.0], np.cumsum(acceleration * dt)])[:-1]
+    places = np.cumsum(truth * dt + 0.5 * acceleration * dt**2) - (truth * dt + 0.5 * acceleration * dt**2)
+    time = dt * np.arange(1000)
+    seen = places + 1e-4 * rng.standard_normal(1000)
+    slopes, half = estimate_slopes(time, seen, none(1000))
+    central = local_quadratic(time, seen, np.zeros(1000, int), 0, 1000, half)[0]
+    assert np.abs(central - truth).max() > 0.3
+    assert np.abs(slopes - truth).max() < 0.05
+    calm = np.abs(np.arange(1000) % 40 - 20) < 15
+    np.testing.assert_array_equal(slopes[calm], central[calm])
+
+
+@pytest.mark.parametrize("step", [0.0, 0.002])
+def test_no_side_is_chosen_for_noise_or_for_the_steps_of_an_encoder(step):
+    rng = np.random.default_rng(4)
+    time = 0.005 * np.arange(4000)
+    seen = 0.3 * np.sin(2 * time) + (1e-4 if not step else 1e-5) * rng.standard_normal(4000)
+    seen = np.round(seen / step) * step if step else seen
+    slopes, half = estimate_slopes(time, seen, none(4000))
+    central = local_quadratic(time, seen, np.zeros(4000, int), 0, 4000, half)[0]
+    assert (slopes == central).mean() > 0.999
+
+
 def test_a_jump_across_a_break_is_not_a_velocity():
     time = np.arange(60) * 0.01
     values = np.where(np.arange(60) < 30, 0.0, 100.0)
