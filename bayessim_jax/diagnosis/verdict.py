@@ -126,6 +126,8 @@ class Thresholds:
     """Times the error of predictions ahead of a candidate that another one has, which makes it shortsighted."""
     worth: float = 0.4
     """Share of what fewer effects leave, below which more effects are worth it."""
+    trace: float = 1e-5
+    """Share of a misfit, and of every channel's, below which what effects leave is their form, and no other effect."""
     worth_ahead: float = 0.9
     """The same of the error of predictions ahead, where fewer effects leave more than `rest_ahead` of it."""
     tie: float = 2.0
@@ -551,13 +553,23 @@ def is_worth(entry: Entry, entries: Sequence[Entry], none: Entry, thresholds: Th
 def _leaves_less(entry: Entry, part: Entry, none: Entry, thresholds: Thresholds) -> bool:
     """Of the misfit of pieces, or, where the part leaves much of the error ahead, of both; and less of that error.
 
-    What is found in short pieces alone bends to how they begin.
+    What is found in short pieces alone bends to how they begin, and beside a trace of a misfit to the form of a law.
     """
+    if _leaves_a_trace(part, none, thresholds):
+        return False
     if part.ahead > thresholds.rest_ahead and entry.ahead > thresholds.worth_ahead * part.ahead:
         return False
     mine, its = share_left(entry.misfit, none.misfit), share_left(part.misfit, none.misfit)
     both = part.ahead > thresholds.doubtful and mine * entry.ahead <= thresholds.worth * its * part.ahead
     return mine <= thresholds.worth * its or both
+
+
+def _leaves_a_trace(entry: Entry, none: Entry, thresholds: Thresholds) -> bool:
+    """Whether a trace is left of the misfit, of no channel's more than that or than noise, and no doubt ahead."""
+    own, was = _powers(entry.misfit, none.misfit)
+    least = (entry.misfit.judged & none.misfit.judged).sum()
+    traces = own.sum() <= thresholds.trace * was.sum() and (own <= np.maximum(thresholds.trace * was, least)).all()
+    return bool(traces) and not entry.ahead > thresholds.doubtful
 
 
 def ties(entry: Entry, best: Entry, none: Entry, thresholds: Thresholds) -> bool:
