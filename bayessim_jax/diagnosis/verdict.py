@@ -144,7 +144,7 @@ class Thresholds:
     """Nats in all by which a candidate has to be worse to be out of the confusion set."""
     ceiling: float = 0.9
     """Share of what a force without a name gains on recordings left out that an answer has to gain there."""
-    held: float = 0.05
+    held: float = 0.03
     """Share of the baseline's squared error beyond noise that an answer may leave on recordings left out."""
     visible: float = 4.0
     """Times what noise allows, from which what is left there counts."""
