@@ -76,6 +76,14 @@ def main() -> None:
     )
     concealed.add_argument("--peers", action="store_true", help="name them by sparse regression (PySINDy), too")
 
+    strangers = commands.add_parser(
+        "strangers", help="diagnoses of machines of another kind, simulated as anyone would"
+    )
+    strangers.add_argument("--cases", type=int, default=60)
+    strangers.add_argument("--seed", type=int, default=1)
+    strangers.add_argument("--part", type=_part, default=(1, 1), metavar="K/N", help="every Nth case from the Kth on")
+    strangers.add_argument("--out", type=Path, help="file of JSON lines to append cases to, and to resume from")
+
     identification = commands.add_parser("identification", help="posteriors of simulated machines against mujoco.sysid")
     identification.add_argument(
         "--rigs", nargs="+", choices=_RIGS, help="machines; five of one to three joints if left out"
@@ -111,6 +119,11 @@ def main() -> None:
         from benchmarks.concealed import diagnose_concealed
 
         diagnose_concealed(options)
+        return
+    if options.command == "strangers":
+        from benchmarks.concealed import diagnose_strangers
+
+        diagnose_strangers(options)
         return
     if options.command == "identification":
         from benchmarks.identification import identify_clean

@@ -28,6 +28,7 @@ __all__ = [
     "GROUPS",
     "diagnose_concealed",
     "diagnose_drawn",
+    "diagnose_strangers",
     "draw_cases",
     "judge",
     "make_drawn",
@@ -182,7 +183,10 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def resumed(
-    cases: Iterable[dict[str, Any]], out: Path | None, make: Callable[[Path, dict[str, Any]], dict[str, Any]]
+    cases: Iterable[dict[str, Any]],
+    out: Path | None,
+    make: Callable[[Path, dict[str, Any]], dict[str, Any]],
+    write: Callable[[Path, dict[str, Any]], dict[str, Any]] = make_drawn,
 ) -> Iterator[dict[str, Any]]:
     """Yield what `make` finds in the folder of every case; rows that the file `out` holds already are not made again.
 
@@ -197,7 +201,7 @@ def resumed(
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder) / "case"
                 try:
-                    sealed = make_drawn(path, case)
+                    sealed = write(path, case)
                 except (StrengthError, AbsorbedError) as error:
                     print(f"{'not made':<12} {case['rig']} {error}", flush=True)
                     continue
@@ -231,6 +235,25 @@ def diagnose_concealed(options: Namespace) -> None:
         sets = {path.stem: _read_judged(path) for path in options.records}
         print(tabulate(sets) if len(sets) > 1 else summarize(*sets.values()))
         return
+    first, parts = options.part
+    drawn = draw_cases(options.rigs or list(MODELS), options.cases, options.seed)
+    rows = _diagnose_all(drawn[first - 1 :: parts], options.out, make_drawn)
+    if options.peers:
+        print(_name_sparsely(rows))
+
+
+def diagnose_strangers(options: Namespace) -> None:
+    """The same of machines that have nothing in common with these."""
+    from benchmarks.strangers import draw_strangers, make_stranger
+
+    first, parts = options.part
+    _diagnose_all(draw_strangers(options.cases, options.seed)[first - 1 :: parts], options.out, make_stranger)
+
+
+def _diagnose_all(
+    cases: Iterable[dict[str, Any]], out: Path | None, write: Callable[[Path, dict[str, Any]], dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Rows of cases, printed as they come, and the scoreboard."""
     jax.config.update("jax_enable_x64", True)
 
     def make(path: Path, case: dict[str, Any]) -> dict[str, Any]:
@@ -249,9 +272,7 @@ def diagnose_concealed(options: Namespace) -> None:
         }
 
     rows = []
-    first, parts = options.part
-    cases = draw_cases(options.rigs or list(MODELS), options.cases, options.seed)[first - 1 :: parts]
-    for made in resumed(cases, options.out, make):
+    for made in resumed(cases, out, make, write):
         row = made | judge(made["sealed"], made)
         rows.append(row)
         hidden = ", ".join(f"{e['effect']}@{e['at']} {e['strength']['measured']:g}" for e in row["sealed"]["effects"])
@@ -260,8 +281,7 @@ def diagnose_concealed(options: Namespace) -> None:
             flush=True,
         )
     print("\n" + summarize(rows))
-    if options.peers:
-        print(_name_sparsely(rows))
+    return rows
 
 
 def _name_sparsely(rows: list[dict[str, Any]]) -> str:

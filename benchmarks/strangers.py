@@ -1,0 +1,500 @@
+"""Machines simulated as a stranger would: MuJoCo in a loop, textbook laws, whatever rate, time step and integrator.
+
+Nothing is shared with `bayessim conceal`: neither machines nor laws, motions or noise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    Law = Callable[[float, float, float], float]
+
+__all__ = ["COMMANDS", "EDITS", "FORCES", "MACHINES", "READINGS", "draw_strangers", "make_stranger"]
+
+GROUPS = {"single": 0.65, "unknown": 0.25, "clean": 0.1}
+"""Shares of the machines: one effect, one of no library, none."""
+STEP = 5e-4
+"""s, the longest time step of a machine."""
+GRAVITY = 9.81
+UNKNOWN = "unknown:"
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What is simulated, and how large things are there."""
+
+    bodies: str
+    """MJCF of what hangs in the world."""
+    joints: tuple[str, ...]
+    motors: tuple[str, ...]
+    """Of the first joints."""
+    body: str
+    """Whose mass is unknown."""
+    forces: tuple[float, ...]
+    """Of each joint: what drives it, or weighs on it."""
+    speeds: tuple[float, ...]
+    reach: float
+    """rad or m that the first joint is to move to each side."""
+    weight: float = 0.0
+    """What the first motor has to hold."""
+    last: str = ""
+    """The body that nothing hangs on."""
+
+    def mjcf(self, integrator: str, timestep: float) -> str:
+        """The model as its user believes it."""
+        motors = "".join(f'<motor name="{m}" joint="{j}"/>' for m, j in zip(self.motors, self.joints, strict=False))
+        return (
+            f'<mujoco><compiler angle="radian"/><option timestep="{timestep}" integrator="{integrator}"/>'
+            f"<worldbody>{self.bodies}</worldbody><actuator>{motors}</actuator></mujoco>"
+        )
+
+
+def _log(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _body(name: str, joint: str, inside: str, place: str = "0 0 0") -> str:
+    return f'<body name="{name}" pos="{place}"><joint name="{joint}" {inside}</body>'
+
+
+def _rod(length: float, mass: float) -> str:
+    size = f'size="0.02" mass="{mass}" contype="0" conaffinity="0"'
+    return f'<geom type="capsule" fromto="0 0 0 0 0 {-length}" {size}/>'
+
+
+def _box(mass: float) -> str:
+    return f'<geom type="box" size="0.1 0.1 0.1" mass="{mass}" contype="0" conaffinity="0"/>'
+
+
+HINGE, SLIDE, LIFT = ('type="hinge" axis="0 1 0"/>', 'type="slide" axis="1 0 0"/>', 'type="slide" axis="0 0 1"/>')
+
+
+def _pendulum(rng: np.random.Generator) -> Machine:
+    length, mass = _log(rng, 0.2, 0.8), _log(rng, 0.2, 2.0)
+    force = 0.4 * mass * GRAVITY * length
+    bodies = _body("bar", "hinge", HINGE + _rod(length, mass))
+    return Machine(bodies, ("hinge",), ("motor",), "bar", (force,), (3.0,), 0.8, last="bar")
+
+
+def _carriage(rng: np.random.Generator) -> Machine:
+    mass = _log(rng, 0.5, 5.0)
+    return Machine(_body("cart", "rail", SLIDE + _box(mass)), ("rail",), ("drive",), "cart", (2.0 * mass,), (1.0,), 0.3)
+
+
+def _lift(rng: np.random.Generator) -> Machine:
+    mass = _log(rng, 1.0, 6.0)
+    bodies = _body("car", "lift", LIFT + _box(mass))
+    return Machine(bodies, ("lift",), ("winch",), "car", (3.0 * mass,), (1.0,), 0.3, weight=mass * GRAVITY)
+
+
+def _crane(rng: np.random.Generator) -> Machine:
+    mass, load, length = _log(rng, 0.5, 3.0), _log(rng, 0.05, 0.5), _log(rng, 0.2, 0.6)
+    bodies = _body("cart", "rail", SLIDE + _box(mass) + _body("pole", "pivot", HINGE + _rod(length, load)))
+    forces = 2.5 * (mass + load), 0.2 * load * GRAVITY
+    return Machine(bodies, ("rail", "pivot"), ("drive",), "pole", forces, (1.0, 4.0), 0.3, last="pole")
+
+
+def _arm(rng: np.random.Generator) -> Machine:
+    upper, fore, m1, m2 = _log(rng, 0.2, 0.5), _log(rng, 0.2, 0.5), _log(rng, 0.5, 2.0), _log(rng, 0.2, 1.0)
+    inner = _body("fore", "elbow", HINGE + _rod(fore, m2), f"0 0 {-upper}")
+    bodies = _body("upper", "shoulder", HINGE + _rod(upper, m1) + inner)
+    forces = 0.7 * GRAVITY * (m1 * upper / 2 + m2 * (upper + fore / 2)), 0.4 * GRAVITY * m2 * fore
+    return Machine(bodies, ("shoulder", "elbow"), ("m1", "m2"), "fore", forces, (3.0, 3.0), 0.8, last="fore")
+
+
+MACHINES = {"pendulum": _pendulum, "carriage": _carriage, "lift": _lift, "crane": _crane, "arm": _arm}
+
+
+@dataclass(frozen=True)
+class Spot:
+    """Where an effect is, and how strong."""
+
+    joint: int
+    size: float
+    """Share of the force there."""
+    force: float
+    speed: float
+    reach: float
+    seconds: float
+    """Of a recording."""
+
+
+def _viscous(model: mujoco.MjModel, spot: Spot, rng: np.random.Generator) -> None:
+    model.dof_damping[spot.joint] += spot.size * spot.force / spot.speed
+
+
+def _coulomb(model: mujoco.MjModel, spot: Spot, rng: np.random.Generator) -> None:
+    model.dof_frictionloss[spot.joint] += 0.7 * spot.size * spot.force
+
+
+def _rotor(model: mujoco.MjModel, spot: Spot, rng: np.random.Generator) -> None:
+    data, inertia = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, inertia)
+    model.dof_armature[spot.joint] += spot.size * inertia[spot.joint, spot.joint]
+
+
+def _spring(model: mujoco.MjModel, spot: Spot, rng: np.random.Generator) -> None:
+    model.jnt_stiffness[spot.joint] = spot.size * spot.force / spot.reach
+    model.qpos_spring[spot.joint] = 0.25 * spot.reach * rng.uniform(-1.0, 1.0)
+
+
+def _tilt(model: mujoco.MjModel, spot: Spot, rng: np.random.Generator) -> None:
+    angle = rng.uniform(0.08, 0.25) * rng.choice([-1.0, 1.0])
+    model.opt.gravity[:] = GRAVITY * math.sin(angle), 0.0, -GRAVITY * math.cos(angle)
+
+
+def _payload(model: mujoco.MjModel, spot: Spot, rng: np.random.Generator) -> None:
+    """A point at the end of the last rod; the long axis of a rod's inertia is its third."""
+    last, add = model.nbody - 1, 1.5 * spot.size * model.body_mass[model.nbody - 1]
+    mass, middle = model.body_mass[last], model.body_ipos[last, 2]
+    centre = (mass * middle + add * 2.0 * middle) / (mass + add)
+    model.body_inertia[last, :2] += mass * (middle - centre) ** 2 + add * (2.0 * middle - centre) ** 2
+    model.body_mass[last], model.body_ipos[last, 2] = mass + add, centre
+
+
+EDITS = {
+    "viscous_friction": _viscous,
+    "coulomb_friction": _coulomb,
+    "armature": _rotor,
+    "joint_spring": _spring,
+    "base_tilt": _tilt,
+    "payload": _payload,
+}
+"""What MuJoCo itself simulates."""
+
+
+def _rubbing(level: Callable[[float], float], width: float) -> Law:
+    return lambda q, v, t: -level(v) * math.tanh(v / width)
+
+
+def _stribeck(spot: Spot, rng: np.random.Generator) -> Law:
+    force = 0.5 * spot.size * spot.force
+    return _rubbing(lambda v: force + force * math.exp(-((v / (0.08 * spot.speed)) ** 2)), 0.004 * spot.speed)
+
+
+def _uneven(spot: Spot, rng: np.random.Generator) -> Law:
+    force = 0.7 * spot.size * spot.force
+    return _rubbing(lambda v: force if v > 0.0 else 0.4 * force, 0.004 * spot.speed)
+
+
+def _drag(spot: Spot, rng: np.random.Generator) -> Law:
+    c = 1.5 * spot.size * spot.force / spot.speed**2
+    return lambda q, v, t: -c * v * abs(v)
+
+
+def _ripple(spot: Spot, rng: np.random.Generator) -> Law:
+    waves, phase = rng.integers(4, 10) / spot.reach, rng.uniform(0.0, 2.0 * math.pi)
+    return lambda q, v, t: 0.7 * spot.size * spot.force * math.sin(waves * q + phase)
+
+
+def _hum(spot: Spot, rng: np.random.Generator) -> Law:
+    phase = rng.uniform(0.0, 2.0 * math.pi)
+    return lambda q, v, t: 0.7 * spot.size * spot.force * math.sin(2.0 * math.pi * 3.3 * t + phase)
+
+
+def _patchy(spot: Spot, rng: np.random.Generator) -> Law:
+    phase, force = rng.uniform(0.0, 2.0 * math.pi), spot.size * spot.force
+    rough = lambda q: math.sin(6.0 * q / spot.reach + phase) > 0.3  # noqa: E731
+    return lambda q, v, t: -force * rough(q) * math.tanh(v / (0.01 * spot.speed))
+
+
+def _detent(spot: Spot, rng: np.random.Generator) -> Law:
+    phase, force = rng.uniform(0.0, 2.0 * math.pi), 0.8 * spot.size * spot.force
+    return lambda q, v, t: -force * math.sin(2.5 * q / spot.reach + phase) * math.exp(-((v / (0.2 * spot.speed)) ** 2))
+
+
+def _fading(spot: Spot, rng: np.random.Generator) -> Law:
+    c = spot.size * spot.force / spot.speed
+    return lambda q, v, t: -c * v * (1.0 + math.cos(2.0 * math.pi * t / 3.0))
+
+
+def _gusts(spot: Spot, rng: np.random.Generator) -> Law:
+    pushes = rng.normal(size=4096)
+    return lambda q, v, t: 0.5 * spot.size * spot.force * pushes[int(t / 0.25) % len(pushes)]
+
+
+FORCES = {
+    "stribeck_friction": _stribeck,
+    "asymmetric_friction": _uneven,
+    "quadratic_drag": _drag,
+    "torque_ripple": _ripple,
+    f"{UNKNOWN}hum": _hum,
+    f"{UNKNOWN}patchy": _patchy,
+    f"{UNKNOWN}detent": _detent,
+    f"{UNKNOWN}fading": _fading,
+    f"{UNKNOWN}gusts": _gusts,
+}
+"""Forces on a joint of its position, its velocity and time."""
+
+
+def _always(change: Callable[[float, float, float], float]) -> Callable[[], Law]:
+    return lambda: change
+
+
+def _gain(spot: Spot, rng: np.random.Generator) -> Callable[[], Law]:
+    gain = 1.0 + spot.size * rng.choice([-1.0, 1.0])
+    return _always(lambda u, v, t: gain * u)
+
+
+def _bias(spot: Spot, rng: np.random.Generator) -> Callable[[], Law]:
+    return _always(lambda u, v, t: u + 0.5 * spot.size * spot.force)
+
+
+def _deadband(spot: Spot, rng: np.random.Generator) -> Callable[[], Law]:
+    width = 0.5 * spot.size * spot.force
+    return _always(lambda u, v, t: math.copysign(max(abs(u) - width, 0.0), u))
+
+
+def _saturation(spot: Spot, rng: np.random.Generator) -> Callable[[], Law]:
+    limit = rng.uniform(0.35, 0.7) * spot.force
+    return _always(lambda u, v, t: float(np.clip(u, -limit, limit)))
+
+
+def _drift(spot: Spot, rng: np.random.Generator) -> Callable[[], Law]:
+    rate = rng.uniform(0.03, 0.08)
+    return _always(lambda u, v, t: u * (1.0 - rate * t))
+
+
+def _drop(spot: Spot, rng: np.random.Generator) -> Callable[[], Law]:
+    when, gain = rng.uniform(0.3, 0.7) * spot.seconds, rng.uniform(0.4, 0.75)
+    return _always(lambda u, v, t: u * (gain if t > when else 1.0))
+
+
+def _back_emf(spot: Spot, rng: np.random.Generator) -> Callable[[], Law]:
+    return _always(lambda u, v, t: u - spot.size * spot.force / spot.speed * v)
+
+
+def _late(spot: Spot, rng: np.random.Generator) -> Callable[[], Law]:
+    count = round(rng.uniform(0.02, 0.06) / STEP)
+
+    def begin() -> Law:
+        queue: deque[float] = deque(maxlen=count + 1)
+        return lambda u, v, t: (queue.append(u), queue[0])[1]
+
+    return begin
+
+
+def _slow(spot: Spot, rng: np.random.Generator) -> Callable[[], Law]:
+    share = 1.0 - math.exp(-STEP / rng.uniform(0.03, 0.12))
+    return lambda: _Following(lambda arrived, u: arrived + share * (u - arrived))
+
+
+def _limited(spot: Spot, rng: np.random.Generator) -> Callable[[], Law]:
+    most = rng.uniform(2.0, 6.0) * spot.force * STEP
+    return lambda: _Following(lambda arrived, u: arrived + float(np.clip(u - arrived, -most, most)))
+
+
+class _Following:
+    """What arrives of a command, beginning with the first one."""
+
+    def __init__(self, follow: Callable[[float, float], float]) -> None:
+        self.follow, self.arrived = follow, None
+
+    def __call__(self, u: float, v: float, t: float) -> float:
+        self.arrived = u if self.arrived is None else self.follow(self.arrived, u)
+        return self.arrived
+
+
+COMMANDS = {
+    "actuator_gain": _gain,
+    "actuator_bias": _bias,
+    "actuator_deadband": _deadband,
+    "actuator_saturation": _saturation,
+    "actuator_rate_limit": _limited,
+    "actuator_delay": _late,
+    "actuator_lag": _slow,
+    "gain_drift": _drift,
+    "gain_drop": _drop,
+    "back_emf": _back_emf,
+}
+"""What becomes of a command, of the joint's velocity and time; a new one for every recording."""
+READINGS = ("sensor_offset", "sensor_scale", "sensor_delay")
+
+
+def draw_strangers(count: int, seed: int) -> list[dict[str, Any]]:
+    """A stated random set of machines."""
+    return [_draw(seed * 100_000 + k) for k in range(count)]
+
+
+def _draw(seed: int) -> dict[str, Any]:
+    rng = np.random.default_rng(seed)
+    group = str(rng.choice(list(GROUPS), p=list(GROUPS.values())))
+    rig = str(rng.choice(list(MACHINES)))
+    names = [*EDITS, *COMMANDS, *READINGS, *(name for name in FORCES if not name.startswith(UNKNOWN))]
+    if rig in ("carriage", "lift"):
+        names = [name for name in names if name not in ("base_tilt", "payload", "sensor_offset")]
+    if group == "unknown":
+        names = [name for name in FORCES if name.startswith(UNKNOWN)]
+    return {
+        "rig": rig,
+        "group": group,
+        "effects": [str(rng.choice(names))] if group != "clean" else [],
+        "size": round(float(rng.uniform(0.2, 0.5)), 3),
+        "rate": int(rng.choice([50, 60, 100, 125, 200, 250, 500, 1000])),
+        "seconds": float(rng.choice([4.0, 6.0, 8.0, 10.0])),
+        "recordings": int(rng.choice([5, 6, 8])),
+        "velocities": bool(rng.uniform() < 0.5),
+        "motion": str(rng.choice(["sines", "steps", "noise", "chirp"])),
+        "feedback": rig == "lift" or bool(rng.uniform() < 0.5),
+        "noise": float(rng.choice([1e-4, 3e-4, 1e-3, 3e-3])),
+        "jitter": float(rng.choice([0.0, 0.0, 0.0, 0.1])),
+        "integrator": str(rng.choice(["Euler", "RK4", "implicitfast"])),
+        "timestep": float(rng.choice([0.001, 0.002, 0.005])),
+        "seed": seed,
+    }
+
+
+def _signal(motion: str, time: Float[np.ndarray, " rows"], rng: np.random.Generator) -> Float[np.ndarray, " rows"]:
+    """What a joint is to follow, or its motor to exert, about 1 in size."""
+    if motion == "steps":
+        return rng.uniform(-1.0, 1.0, int(time[-1] / 0.4) + 1)[(time / 0.4).astype(int)]
+    if motion == "chirp":
+        return np.sin(2.0 * np.pi * (0.2 * time + 0.9 * time**2 / time[-1]) + rng.uniform(0.0, 6.28))
+    count, high = (3, 1.5) if motion == "sines" else (30, 2.0)
+    waves = np.sin(2.0 * np.pi * np.outer(rng.uniform(0.2, high, count), time) + rng.uniform(0.0, 6.28, (count, 1)))
+    return 1.4 * rng.dirichlet(np.full(count, 2.0)) @ waves * (1.0 if count == 3 else 2.0)
+
+
+def make_stranger(folder: Path, case: dict[str, Any]) -> dict[str, Any]:
+    """Write a case that was drawn; returns what is hidden in it."""
+    rng = np.random.default_rng(case["seed"] + 1)
+    machine = MACHINES[case["rig"]](rng)
+    text = machine.mjcf(case["integrator"], case["timestep"])
+    name = case["effects"][0] if case["effects"] else ""
+    joint = int(rng.integers(len(machine.motors if name in COMMANDS else machine.joints)))
+    if name == "sensor_offset":
+        joint = len(machine.joints) - 1  # where a rail begins is nobody's business
+    scale = machine.forces[joint], machine.speeds[joint], machine.reach
+    spot = Spot(joint, case["size"], *scale, case["seconds"])
+    model = mujoco.MjModel.from_xml_string(text)
+    body = model.body(machine.body).id
+    believed, factor = float(model.body_mass[body]), rng.uniform(0.85, 1.2)
+    model.body_mass[body] *= factor
+    model.body_inertia[body] *= factor
+    unknown = [(f"{machine.body}_mass", f"body/{machine.body}/mass", 0.5 * believed, 2.0 * believed)]
+    truth = {unknown[0][0]: float(model.body_mass[body])}
+    for j, known in enumerate(machine.joints):
+        if rng.uniform() < 0.4 and name not in ("viscous_friction", "back_emf"):
+            damping = rng.uniform(0.05, 0.3) * machine.forces[j] / machine.speeds[j]
+            model.dof_damping[j], truth[f"{known}_damping"] = damping, damping
+            unknown.append((f"{known}_damping", f"joint/{known}/damping", 0.0, 4.0 * damping))
+    if name in EDITS:
+        EDITS[name](model, spot, rng)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    law = FORCES[name](spot, rng) if name in FORCES else None
+    begin = COMMANDS[name](spot, rng) if name in COMMANDS else None
+    offset, scaled = spot.reach * rng.uniform(0.05, 0.2), 1.0 + 0.3 * case["size"]
+    late = max(1, round(0.02 * case["rate"])) if name == "sensor_delay" else 0
+    (folder / "recordings").mkdir(parents=True)
+    for k in range(case["recordings"]):
+        q, v, ctrl = _record(model, machine, case, spot, law, begin() if begin else None, rng)
+        if late:
+            q[:, joint] = np.concatenate([np.full(late, q[0, joint]), q[:-late, joint]])
+        if name == "sensor_offset":
+            q[:, joint] += offset
+        if name == "sensor_scale":
+            q[:, joint] *= scaled
+            v[:, joint] *= scaled
+        _write_recording(folder / "recordings" / f"run{k + 1}.csv", machine, case, q, v, ctrl, rng)
+    (folder / "model.xml").write_text(text, encoding="utf-8")
+    lines = [
+        "schema = 1",
+        f'name = "stranger-{case["seed"]}"',
+        'model = "model.xml"',
+        'recordings = "recordings/*.csv"',
+    ]
+    for parameter, target, low, high in unknown:
+        prior = f'{{ distribution = "uniform", low = {low!r}, high = {high!r} }}'
+        lines += ["", "[[parameters]]", f'name = "{parameter}"', f'targets = ["{target}"]', f"prior = {prior}"]
+    (folder / "case.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    place, moved = _place(name, machine, joint)
+    hidden = {"effect": name, "at": place, "joint": moved, "strength": {"measured": case["size"]}, "parameters": {}}
+    return {"effects": [hidden] if name else [], "parameters": truth}
+
+
+def _place(name: str, machine: Machine, joint: int) -> tuple[str, str | None]:
+    """Where an effect is, and the joint that it is at, if it is at one."""
+    at = f"joint/{machine.joints[joint]}"
+    if name == "base_tilt":
+        return "world", None
+    if name == "payload":
+        return f"body/{machine.last}", None
+    if name in COMMANDS:
+        return f"actuator/{machine.motors[joint]}", at
+    return f"{at}/qpos" if name in READINGS else at, at
+
+
+def _record(
+    model: mujoco.MjModel,
+    machine: Machine,
+    case: dict[str, Any],
+    spot: Spot,
+    law: Law | None,
+    motor: Law | None,
+    rng: np.random.Generator,
+) -> tuple[Float[np.ndarray, "rows nq"], Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nu"]]:
+    """One recording: what the machine did, and what its motors were told."""
+    period = 1.0 / case["rate"]
+    held = max(1, math.ceil(period / STEP - 1e-9))
+    model.opt.timestep = period / held
+    time = period * np.arange(int(case["seconds"] * case["rate"]))
+    wanted = np.stack([_signal(case["motion"], time, rng) for _ in machine.motors], 1)
+    data, count = mujoco.MjData(model), len(machine.motors)
+    data.qpos[:] = 0.7 * machine.reach * rng.uniform(-1.0, 1.0, model.nq)
+    usual = np.array(machine.forces[:count])
+    stiff = 3.0 * usual / machine.reach
+    q, v, ctrl = np.zeros((len(time), model.nq)), np.zeros((len(time), model.nv)), np.zeros(wanted.shape)
+    for i in range(len(time)):
+        q[i], v[i] = data.qpos, data.qvel
+        place, rate = q[i, :count], v[i, :count]
+        if case["feedback"]:
+            error = machine.reach * wanted[i] - place - 0.12 * rate
+            ctrl[i] = np.clip(stiff * error, -4.0 * usual, 4.0 * usual)
+        else:
+            ctrl[i] = usual * wanted[i]
+        if not case["feedback"] and machine.joints[0] == "rail":
+            ctrl[i, 0] -= usual[0] * (place[0] + 0.3 * rate[0])
+        ctrl[i, 0] += machine.weight
+        for _ in range(held):
+            data.ctrl[:] = ctrl[i]
+            if motor is not None:
+                data.ctrl[spot.joint] = motor(float(ctrl[i, spot.joint]), float(data.qvel[spot.joint]), data.time)
+            if law is not None:
+                at = float(data.qpos[spot.joint]), float(data.qvel[spot.joint])
+                data.qfrc_applied[spot.joint] = law(*at, data.time)
+            mujoco.mj_step(model, data)
+    return q, v, ctrl
+
+
+def _write_recording(
+    path: Path,
+    machine: Machine,
+    case: dict[str, Any],
+    q: Float[np.ndarray, "rows nq"],
+    v: Float[np.ndarray, "rows nv"],
+    ctrl: Float[np.ndarray, "rows nu"],
+    rng: np.random.Generator,
+) -> None:
+    """What sensors showed of it, with their noise; velocities have twenty times as much as positions."""
+    period = 1.0 / case["rate"]
+    time = period * (np.arange(len(q)) + case["jitter"] * rng.uniform(-0.5, 0.5, len(q)))
+    names = ["time", *(f"joint/{joint}/qpos" for joint in machine.joints)]
+    columns = [time[:, None], q + case["noise"] * rng.normal(size=q.shape)]
+    if case["velocities"]:
+        names += [f"joint/{joint}/qvel" for joint in machine.joints]
+        columns.append(v + 20.0 * case["noise"] * rng.normal(size=v.shape))
+    names += [f"actuator/{motor}/ctrl" for motor in machine.motors]
+    table = np.concatenate([*columns, ctrl], 1)
+    np.savetxt(path, table, fmt="%.9g", delimiter=",", header=",".join(names), comments="")

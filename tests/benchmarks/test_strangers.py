@@ -1,0 +1,35 @@
+"""Machines simulated as a stranger would are cases, and hide what they say they hide."""
+
+import numpy as np
+import pytest
+
+from bayessim_jax.effects import EFFECTS
+from bayessim_jax.recordings.loading import load_case
+from benchmarks.strangers import COMMANDS, EDITS, FORCES, READINGS, UNKNOWN, draw_strangers, make_stranger
+
+SHORT = {"seconds": 1.0, "recordings": 1, "rate": 100, "noise": 1e-9, "jitter": 0.0, "velocities": True}
+
+
+def of(case, **settings):
+    return case | SHORT | settings
+
+
+def test_a_set_is_drawn_again_and_holds_every_group():
+    drawn = draw_strangers(60, 3)
+    assert drawn == draw_strangers(60, 3) and drawn != draw_strangers(60, 4)
+    assert {case["group"] for case in drawn} == {"single", "unknown", "clean"}
+    assert all(len(case["effects"]) == (case["group"] != "clean") for case in drawn)
+
+
+@pytest.mark.parametrize("name", [*EDITS, *COMMANDS, *READINGS, *FORCES])
+def test_every_effect_is_at_a_place_of_the_library_and_seen_in_what_is_recorded(tmp_path, name):
+    case = of(draw_strangers(1, 5)[0], rig="arm", motion="sines", feedback=False, effects=[name])
+    sealed = make_stranger(tmp_path / "with", case)
+    make_stranger(tmp_path / "without", case | {"effects": []})
+    found, plain = (load_case(tmp_path / which).check() for which in ("with", "without"))
+    (hidden,) = sealed["effects"]
+    if not name.startswith(UNKNOWN):
+        assert hidden["at"] in [place.partition("#")[0] for place in EFFECTS[name].places(found.model)]
+    columns = [np.concatenate([r.qpos, r.qvel], 1) for each in (found, plain) for r in each.recordings]
+    assert np.isfinite(columns[0]).all()
+    assert sealed["parameters"] and not np.allclose(columns[0], columns[1], atol=1e-4)
