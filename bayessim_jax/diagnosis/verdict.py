@@ -127,7 +127,7 @@ class Thresholds:
     worth: float = 0.4
     """Share of what fewer effects leave, below which more effects are worth it."""
     trace: float = 1e-5
-    """Share of a misfit, and of every channel's, below which what effects leave is their form, and no other effect."""
+    """Share of a misfit, below which what effects leave is the form of their laws, and no other effect."""
     worth_ahead: float = 0.9
     """The same of the error of predictions ahead, where fewer effects leave more than `rest_ahead` of it."""
     tie: float = 2.0
@@ -565,11 +565,8 @@ def _leaves_less(entry: Entry, part: Entry, none: Entry, thresholds: Thresholds)
 
 
 def _leaves_a_trace(entry: Entry, none: Entry, thresholds: Thresholds) -> bool:
-    """Whether a trace is left of the misfit, of no channel's more than that or than noise, and no doubt ahead."""
-    own, was = _powers(entry.misfit, none.misfit)
-    least = (entry.misfit.judged & none.misfit.judged).sum()
-    traces = own.sum() <= thresholds.trace * was.sum() and (own <= np.maximum(thresholds.trace * was, least)).all()
-    return bool(traces) and not entry.ahead > thresholds.doubtful
+    """Whether next to nothing is left of the misfit, and no doubt of the time ahead."""
+    return share_left(entry.misfit, none.misfit) <= thresholds.trace and not entry.ahead > thresholds.doubtful
 
 
 def ties(entry: Entry, best: Entry, none: Entry, thresholds: Thresholds) -> bool:
