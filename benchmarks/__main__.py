@@ -121,7 +121,7 @@ def main() -> None:
         diagnose_concealed(options)
         return
     if options.command == "strangers":
-        from benchmarks.concealed import diagnose_strangers
+        from benchmarks.strangers import diagnose_strangers
 
         diagnose_strangers(options)
         return

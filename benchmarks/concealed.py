@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "GROUPS",
+    "diagnose_all",
     "diagnose_concealed",
     "diagnose_drawn",
-    "diagnose_strangers",
     "draw_cases",
     "judge",
     "make_drawn",
@@ -235,25 +235,15 @@ def diagnose_concealed(options: Namespace) -> None:
         sets = {path.stem: _read_judged(path) for path in options.records}
         print(tabulate(sets) if len(sets) > 1 else summarize(*sets.values()))
         return
-    first, parts = options.part
-    drawn = draw_cases(options.rigs or list(MODELS), options.cases, options.seed)
-    rows = _diagnose_all(drawn[first - 1 :: parts], options.out, make_drawn)
+    rows = diagnose_all(draw_cases(options.rigs or list(MODELS), options.cases, options.seed), options, make_drawn)
     if options.peers:
         print(_name_sparsely(rows))
 
 
-def diagnose_strangers(options: Namespace) -> None:
-    """The same of machines that have nothing in common with these."""
-    from benchmarks.strangers import draw_strangers, make_stranger
-
-    first, parts = options.part
-    _diagnose_all(draw_strangers(options.cases, options.seed)[first - 1 :: parts], options.out, make_stranger)
-
-
-def _diagnose_all(
-    cases: Iterable[dict[str, Any]], out: Path | None, write: Callable[[Path, dict[str, Any]], dict[str, Any]]
+def diagnose_all(
+    drawn: Sequence[dict[str, Any]], options: Namespace, write: Callable[[Path, dict[str, Any]], dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Rows of cases, printed as they come, and the scoreboard."""
+    """Rows of the cases that are asked for, printed as they come, and the scoreboard."""
     jax.config.update("jax_enable_x64", True)
 
     def make(path: Path, case: dict[str, Any]) -> dict[str, Any]:
@@ -272,7 +262,8 @@ def _diagnose_all(
         }
 
     rows = []
-    for made in resumed(cases, out, make, write):
+    first, parts = options.part
+    for made in resumed(drawn[first - 1 :: parts], options.out, make, write):
         row = made | judge(made["sealed"], made)
         rows.append(row)
         hidden = ", ".join(f"{e['effect']}@{e['at']} {e['strength']['measured']:g}" for e in row["sealed"]["effects"])

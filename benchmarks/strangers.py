@@ -14,20 +14,32 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from bayessim_jax.concealment import UNKNOWN
+from benchmarks.concealed import diagnose_all
+
 if TYPE_CHECKING:
+    from argparse import Namespace
     from collections.abc import Callable
     from pathlib import Path
 
     Law = Callable[[float, float, float], float]
 
-__all__ = ["COMMANDS", "EDITS", "FORCES", "MACHINES", "READINGS", "draw_strangers", "make_stranger"]
+__all__ = [
+    "COMMANDS",
+    "EDITS",
+    "FORCES",
+    "MACHINES",
+    "READINGS",
+    "diagnose_strangers",
+    "draw_strangers",
+    "make_stranger",
+]
 
 GROUPS = {"single": 0.65, "unknown": 0.25, "clean": 0.1}
 """Shares of the machines: one effect, one of no library, none."""
-STEP = 5e-4
-"""s, the longest time step of a machine."""
+STEP, INTEGRATOR = 5e-4, "implicitfast"
+"""s, the longest time step of a machine, and how it is stepped."""
 GRAVITY = 9.81
-UNKNOWN = "unknown:"
 
 
 @dataclass(frozen=True)
@@ -40,7 +52,7 @@ class Machine:
     motors: tuple[str, ...]
     """Of the first joints."""
     body: str
-    """Whose mass is unknown."""
+    """The last one, whose mass is unknown."""
     forces: tuple[float, ...]
     """Of each joint: what drives it, or weighs on it."""
     speeds: tuple[float, ...]
@@ -48,8 +60,6 @@ class Machine:
     """rad or m that the first joint is to move to each side."""
     weight: float = 0.0
     """What the first motor has to hold."""
-    last: str = ""
-    """The body that nothing hangs on."""
 
     def mjcf(self, integrator: str, timestep: float) -> str:
         """The model as its user believes it."""
@@ -84,7 +94,7 @@ def _pendulum(rng: np.random.Generator) -> Machine:
     length, mass = _log(rng, 0.2, 0.8), _log(rng, 0.2, 2.0)
     force = 0.4 * mass * GRAVITY * length
     bodies = _body("bar", "hinge", HINGE + _rod(length, mass))
-    return Machine(bodies, ("hinge",), ("motor",), "bar", (force,), (3.0,), 0.8, last="bar")
+    return Machine(bodies, ("hinge",), ("motor",), "bar", (force,), (3.0,), 0.8)
 
 
 def _carriage(rng: np.random.Generator) -> Machine:
@@ -102,7 +112,7 @@ def _crane(rng: np.random.Generator) -> Machine:
     mass, load, length = _log(rng, 0.5, 3.0), _log(rng, 0.05, 0.5), _log(rng, 0.2, 0.6)
     bodies = _body("cart", "rail", SLIDE + _box(mass) + _body("pole", "pivot", HINGE + _rod(length, load)))
     forces = 2.5 * (mass + load), 0.2 * load * GRAVITY
-    return Machine(bodies, ("rail", "pivot"), ("drive",), "pole", forces, (1.0, 4.0), 0.3, last="pole")
+    return Machine(bodies, ("rail", "pivot"), ("drive",), "pole", forces, (1.0, 4.0), 0.3)
 
 
 def _arm(rng: np.random.Generator) -> Machine:
@@ -110,7 +120,7 @@ def _arm(rng: np.random.Generator) -> Machine:
     inner = _body("fore", "elbow", HINGE + _rod(fore, m2), f"0 0 {-upper}")
     bodies = _body("upper", "shoulder", HINGE + _rod(upper, m1) + inner)
     forces = 0.7 * GRAVITY * (m1 * upper / 2 + m2 * (upper + fore / 2)), 0.4 * GRAVITY * m2 * fore
-    return Machine(bodies, ("shoulder", "elbow"), ("m1", "m2"), "fore", forces, (3.0, 3.0), 0.8, last="fore")
+    return Machine(bodies, ("shoulder", "elbow"), ("m1", "m2"), "fore", forces, (3.0, 3.0), 0.8)
 
 
 MACHINES = {"pendulum": _pendulum, "carriage": _carriage, "lift": _lift, "crane": _crane, "arm": _arm}
@@ -323,6 +333,11 @@ COMMANDS = {
 READINGS = ("sensor_offset", "sensor_scale", "sensor_delay")
 
 
+def diagnose_strangers(options: Namespace) -> None:
+    """Diagnose the cases that are not in the file yet, and print what became of all."""
+    diagnose_all(draw_strangers(options.cases, options.seed), options, make_stranger)
+
+
 def draw_strangers(count: int, seed: int) -> list[dict[str, Any]]:
     """A stated random set of machines."""
     return [_draw(seed * 100_000 + k) for k in range(count)]
@@ -335,12 +350,17 @@ def _draw(seed: int) -> dict[str, Any]:
     names = [*EDITS, *COMMANDS, *READINGS, *(name for name in FORCES if not name.startswith(UNKNOWN))]
     if rig in ("carriage", "lift"):
         names = [name for name in names if name not in ("base_tilt", "payload", "sensor_offset")]
+    if rig == "lift":
+        names.remove("actuator_saturation")  # a motor that cannot hold the weight is no lift's
     if group == "unknown":
         names = [name for name in FORCES if name.startswith(UNKNOWN)]
+    effects = [str(rng.choice(names))] if group != "clean" else []
+    apart = {"viscous_friction", "back_emf"}.isdisjoint(effects)
     return {
         "rig": rig,
         "group": group,
-        "effects": [str(rng.choice(names))] if group != "clean" else [],
+        "effects": effects,
+        "damped": apart and bool(rng.uniform() < 0.4),
         "size": round(float(rng.uniform(0.2, 0.5)), 3),
         "rate": int(rng.choice([50, 60, 100, 125, 200, 250, 500, 1000])),
         "seconds": float(rng.choice([4.0, 6.0, 8.0, 10.0])),
@@ -369,46 +389,43 @@ def _signal(motion: str, time: Float[np.ndarray, " rows"], rng: np.random.Genera
 
 def make_stranger(folder: Path, case: dict[str, Any]) -> dict[str, Any]:
     """Write a case that was drawn; returns what is hidden in it."""
-    rng = np.random.default_rng(case["seed"] + 1)
-    machine = MACHINES[case["rig"]](rng)
-    text = machine.mjcf(case["integrator"], case["timestep"])
+    build, hide, move = np.random.default_rng(case["seed"] + 1).spawn(3)
+    machine = MACHINES[case["rig"]](build)
     name = case["effects"][0] if case["effects"] else ""
-    joint = int(rng.integers(len(machine.motors if name in COMMANDS else machine.joints)))
+    joint = int(hide.integers(len(machine.motors if name in COMMANDS else machine.joints)))
     if name == "sensor_offset":
         joint = len(machine.joints) - 1  # where a rail begins is nobody's business
     scale = machine.forces[joint], machine.speeds[joint], machine.reach
     spot = Spot(joint, case["size"], *scale, case["seconds"])
-    model = mujoco.MjModel.from_xml_string(text)
+    model = mujoco.MjModel.from_xml_string(machine.mjcf(INTEGRATOR, STEP))
     body = model.body(machine.body).id
-    believed, factor = float(model.body_mass[body]), rng.uniform(0.85, 1.2)
+    believed, factor = float(model.body_mass[body]), build.uniform(0.85, 1.2)
     model.body_mass[body] *= factor
     model.body_inertia[body] *= factor
     unknown = [(f"{machine.body}_mass", f"body/{machine.body}/mass", 0.5 * believed, 2.0 * believed)]
     truth = {unknown[0][0]: float(model.body_mass[body])}
-    for j, known in enumerate(machine.joints):
-        if rng.uniform() < 0.4 and name not in ("viscous_friction", "back_emf"):
-            damping = rng.uniform(0.05, 0.3) * machine.forces[j] / machine.speeds[j]
-            model.dof_damping[j], truth[f"{known}_damping"] = damping, damping
-            unknown.append((f"{known}_damping", f"joint/{known}/damping", 0.0, 4.0 * damping))
+    for j, known in enumerate(machine.joints if case["damped"] else ()):
+        damping = build.uniform(0.05, 0.3) * machine.forces[j] / machine.speeds[j]
+        model.dof_damping[j], truth[f"{known}_damping"] = damping, damping
+        unknown.append((f"{known}_damping", f"joint/{known}/damping", 0.0, 4.0 * damping))
     if name in EDITS:
-        EDITS[name](model, spot, rng)
+        EDITS[name](model, spot, hide)
     mujoco.mj_setConst(model, mujoco.MjData(model))
-    law = FORCES[name](spot, rng) if name in FORCES else None
-    begin = COMMANDS[name](spot, rng) if name in COMMANDS else None
-    offset, scaled = spot.reach * rng.uniform(0.05, 0.2), 1.0 + 0.3 * case["size"]
+    law = FORCES[name](spot, hide) if name in FORCES else None
+    begin = COMMANDS[name](spot, hide) if name in COMMANDS else None
+    offset, scaled = spot.reach * hide.uniform(0.05, 0.2), 1.0 + 0.3 * case["size"]
     late = max(1, round(0.02 * case["rate"])) if name == "sensor_delay" else 0
     (folder / "recordings").mkdir(parents=True)
     for k in range(case["recordings"]):
-        q, v, ctrl = _record(model, machine, case, spot, law, begin() if begin else None, rng)
+        q, v, ctrl = _record(model, machine, case, spot, law, begin() if begin else None, move)
         if late:
             q[:, joint] = np.concatenate([np.full(late, q[0, joint]), q[:-late, joint]])
         if name == "sensor_offset":
             q[:, joint] += offset
         if name == "sensor_scale":
             q[:, joint] *= scaled
-            v[:, joint] *= scaled
-        _write_recording(folder / "recordings" / f"run{k + 1}.csv", machine, case, q, v, ctrl, rng)
-    (folder / "model.xml").write_text(text, encoding="utf-8")
+        _write_recording(folder / "recordings" / f"run{k + 1}.csv", machine, case, q, v, ctrl, move)
+    (folder / "model.xml").write_text(machine.mjcf(case["integrator"], case["timestep"]), encoding="utf-8")
     lines = [
         "schema = 1",
         f'name = "stranger-{case["seed"]}"',
@@ -430,7 +447,7 @@ def _place(name: str, machine: Machine, joint: int) -> tuple[str, str | None]:
     if name == "base_tilt":
         return "world", None
     if name == "payload":
-        return f"body/{machine.last}", None
+        return f"body/{machine.body}", None
     if name in COMMANDS:
         return f"actuator/{machine.motors[joint]}", at
     return f"{at}/qpos" if name in READINGS else at, at

@@ -126,10 +126,10 @@ class Thresholds:
     """Times the error of predictions ahead of a candidate that another one has, which makes it shortsighted."""
     worth: float = 0.4
     """Share of what fewer effects leave, below which more effects are worth it."""
-    trace: float = 1e-5
-    """Share of a misfit, below which what effects leave is the form of their laws, and no other effect."""
     worth_ahead: float = 0.9
     """The same of the error of predictions ahead, where fewer effects leave more than `rest_ahead` of it."""
+    trace: float = 1e-5
+    """Share of a misfit, below which what effects leave is the form of their laws, and no other effect."""
     tie: float = 2.0
     """Standard errors within which two candidates predict held-out windows alike."""
     blur: float = 0.005

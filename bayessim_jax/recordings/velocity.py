@@ -39,7 +39,7 @@ def estimate_slopes(
     half = choose_half_width(time, values, run)
     slopes, left = _fit_all(time, values, run, half, 0)
     some = left[(left > 0.0) & np.isfinite(left)]
-    bent = left > BENT * (np.median(some) if some.size else 0.0)
+    bent = left > BENT * (np.median(some) if some.size else np.inf)
     if bent.any():
         least = np.where(bent, CLEAN * left, 0.0)
         for side in (-half, half):

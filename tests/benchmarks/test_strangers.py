@@ -7,7 +7,15 @@ from bayessim_jax.effects import EFFECTS
 from bayessim_jax.recordings.loading import load_case
 from benchmarks.strangers import COMMANDS, EDITS, FORCES, READINGS, UNKNOWN, draw_strangers, make_stranger
 
-SHORT = {"seconds": 1.0, "recordings": 1, "rate": 100, "noise": 1e-9, "jitter": 0.0, "velocities": True}
+SHORT = {
+    "seconds": 1.0,
+    "recordings": 1,
+    "rate": 100,
+    "noise": 1e-9,
+    "jitter": 0.0,
+    "velocities": True,
+    "damped": False,
+}
 
 
 def of(case, **settings):
