@@ -20,6 +20,7 @@ from bayessim_jax.inference.scores import compare, score
 from bayessim_jax.recordings.assemble import read_recording
 from bayessim_jax.recordings.diagnosing import CaseDiagnosis
 from bayessim_jax.recordings.files import to_json, write_text
+from bayessim_jax.recordings.late import without_velocities
 from bayessim_jax.recordings.loading import LoadedCase, load_case
 from bayessim_jax.recordings.readers import SUFFIXES
 from bayessim_jax.recordings.run_folder import RunFolder
@@ -139,7 +140,7 @@ def with_recordings(case: LoadedCase, pattern: str) -> LoadedCase:
             first = errors[0]
             raise CaseError(first.file, first.what, first.remedy, first.row)
         recordings.append(recording)
-    return dataclasses.replace(case, recordings=tuple(recordings))
+    return dataclasses.replace(case, recordings=without_velocities(recordings, case.layout, case.late))
 
 
 def read_table(path: Path) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from bayessim_jax.recordings.assemble import read_recording
 from bayessim_jax.recordings.augment import write_values
 from bayessim_jax.recordings.case import FILE, Case, read_case
+from bayessim_jax.recordings.late import find_late, without_velocities
 from bayessim_jax.recordings.layout import Layout, layout_of_model, layout_of_system
 from bayessim_jax.recordings.mjcf import compile_spec, read_spec
 from bayessim_jax.recordings.parameters import Parameter, resolve_parameters
@@ -16,7 +17,7 @@ from bayessim_jax.recordings.windows import Windows, find_windows, stack_windows
 from bayessim_jax.recordings.wording import CaseError, Finding, hint, merge, quote
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from bayessim_jax.recordings.recording import CaseRecording
 
@@ -37,6 +38,8 @@ class LoadedCase:
     """The compiled `mujoco.MjModel` at its own values; None for a registered system."""
     spec: Any = field(default=None, repr=False)
     """The `mujoco.MjSpec` that it was compiled from."""
+    late: tuple[str, ...] = ()
+    """Velocities that are later than the positions, and not used."""
 
     @property
     def errors(self) -> list[Finding]:
@@ -97,11 +100,17 @@ def load_case(folder: str | Path, *, mask: bool = False) -> LoadedCase:
     found += _channels(case, layout) + _unnamed(case, layout)
     if spec is not None and not any(f.severity == "error" for f in found):
         found += _possible(case, spec, parameters)
-    recordings: list[CaseRecording] = []
+    recordings: Sequence[CaseRecording] = []
     if not _unnamed(case, layout):
         recordings, more = _recordings(case, layout)
         found += more
-    return LoadedCase(case, layout, parameters, tuple(recordings), tuple(_judge_holes(merge(found), mask)), model, spec)
+    late: tuple[str, ...] = ()
+    if model is not None and recordings:
+        late, more = find_late(recordings, layout, model, case.horizon)
+        recordings = without_velocities(recordings, layout, late)
+        found += more
+    findings = tuple(_judge_holes(merge(found), mask))
+    return LoadedCase(case, layout, parameters, tuple(recordings), findings, model, spec, late)
 
 
 def _judge_holes(findings: list[Finding], mask: bool) -> list[Finding]:

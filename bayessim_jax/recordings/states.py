@@ -13,7 +13,7 @@ from bayessim_jax.recordings.velocity import estimate_slopes
 if TYPE_CHECKING:
     from bayessim_jax.recordings.layout import Layout
 
-__all__ = ["fill_in", "joint_velocities"]
+__all__ = ["fill_in", "joint_velocities", "slopes_between"]
 
 
 def fill_in(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -61,11 +61,13 @@ def joint_velocities(
                 rates[q] = _angular(time, qpos[:, q : q + 4], whole, wide)
             qvel[:, i], halves[i] = rates[q][0][:, k], rates[q][1]
         else:
-            qvel[:, i], halves[i] = _slopes(time, qpos[:, place[i]], measured[:, place[i]], wide)
+            qvel[:, i], halves[i] = slopes_between(time, qpos[:, place[i]], measured[:, place[i]], wide)
     return qvel, seen, tuple(halves)
 
 
-def _slopes(time: np.ndarray, values: np.ndarray, measured: np.ndarray, wide: np.ndarray) -> tuple[np.ndarray, int]:
+def slopes_between(
+    time: np.ndarray, values: np.ndarray, measured: np.ndarray, wide: np.ndarray
+) -> tuple[np.ndarray, int]:
     """Slopes at every row from the rows that were measured."""
     rows = np.flatnonzero(measured)
     if len(rows) < 2:
@@ -83,7 +85,7 @@ def _angular(
     time: np.ndarray, quaternion: np.ndarray, measured: np.ndarray, wide: np.ndarray
 ) -> tuple[np.ndarray, int]:
     """Angular velocity in the body's frame, ω = 2 vec(q̄ ⊗ dq/dt), of a unit quaternion w, x, y, z."""
-    slopes = [_slopes(time, quaternion[:, k], measured, wide) for k in range(4)]
+    slopes = [slopes_between(time, quaternion[:, k], measured, wide) for k in range(4)]
     (w, x, y, z), (dw, dx, dy, dz) = quaternion.T, (s for s, _ in slopes)
     turn = (w * dx - x * dw - y * dz + z * dy, w * dy - y * dw - z * dx + x * dz, w * dz - z * dw - x * dy + y * dx)
     return 2 * np.stack(turn, 1), max(half for _, half in slopes)

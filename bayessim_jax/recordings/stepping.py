@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from bayessim_jax.beliefs.margins import Margins, normal
 from bayessim_jax.diagnosis.bench import Bench, Candidate
@@ -32,6 +32,7 @@ from bayessim_jax.inference.direct import estimate_noise, fit_direct, noise_floo
 from bayessim_jax.inference.replay import Inputs, Restarted
 from bayessim_jax.inference.shooting import Fit, Predict, Shots, eliminate, normal_equations
 from bayessim_jax.programs import trace_once
+from bayessim_jax.recordings.late import BLUR, measure_lag
 from bayessim_jax.recordings.shots import (
     REFINED,
     CaseModel,
@@ -54,10 +55,6 @@ SURE = 0.25
 """Of s that is uncertain at least, for what interpolation does not hold."""
 BEYOND = 3.0
 """Standard deviations by which s may be found below 0 or above 1, or longer than positions and velocities tell."""
-BLUR = 0.05
-"""Of s as they tell it: standard deviation for what trapezoids leave of an integral."""
-PIECE, FEWEST = 0.15, 30
-"""Seconds over which positions and velocities are compared, and how many such pieces it takes at least."""
 PASSES, STILL = 4, 0.1
 """Times at most that the steps' effect is computed anew where a fit to recordings without it has ended, and of the
 standard deviation of s by how little it has to move for the last of them."""
@@ -263,59 +260,19 @@ def ratio_of_motion(model: CaseModel, windows: Windows) -> tuple[float, float]:
 
         Δq − ∫ v dt = s h/2 Δv
 
-    with the integral by trapezoids. A regression of the left side on Δv, and on Δq for scales that are off, together
-    with `RATIO`; that alone where joints' velocities are not measured, or are late by more than a step could do, or
-    where the integrator is another one.
+    which `measure_lag` tells, together with `RATIO`; that alone where joints' velocities are not measured, or are late
+    by more than a step could do, or where the integrator is another one.
     """
     m = model.compiled
     found: list[tuple[float, float]] = [(RATIO.a, RATIO.b)]
     if m.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
         for _, q, v in model.case.layout.single:
             there = windows.qpos_measured[:, :, q] & windows.qvel_measured[:, :, v]
-            leads = _lead(windows.time, windows.qpos[:, :, q], windows.qvel[:, :, v], there)
-            told = ((2.0 * lead / m.opt.timestep, np.hypot(2.0 * sd / m.opt.timestep, BLUR)) for lead, sd in leads)
+            lags = measure_lag(windows.time, windows.qpos[:, :, q], windows.qvel[:, :, v], there)
+            told = ((2.0 * lag / m.opt.timestep, np.hypot(2.0 * sd / m.opt.timestep, BLUR)) for lag, sd in lags)
             found += [(s, sd) for s, sd in told if -BEYOND * sd < s < 1.0 + BEYOND * sd]
     weights = np.array([1.0 / sd**2 for _, sd in found])
     return float(weights @ [mean for mean, _ in found] / weights.sum()), float(weights.sum() ** -0.5)
-
-
-def _lead(
-    time: Float[np.ndarray, "windows rows"],
-    q: Float[np.ndarray, "windows rows"],
-    v: Float[np.ndarray, "windows rows"],
-    there: Bool[np.ndarray, "windows rows"],
-) -> list[tuple[float, float]]:
-    """By how many seconds of its own motion a joint's position is ahead, with a standard deviation, if that is told.
-
-    The noise of Δv makes a slope smaller; it is known from second differences. Pieces that lie far off, such as those
-    of an impact between two rows, are left out.
-    """
-    steps = np.diff(time, axis=1)
-    passed = np.cumsum(0.5 * (v[:, 1:] + v[:, :-1]) * steps, axis=1)
-    travel = np.concatenate([np.zeros((len(v), 1)), passed], axis=1)
-    rows = max(round(PIECE / float(np.median(steps[steps > 0]))), 2) if (steps > 0).any() else time.shape[1]
-    first = np.arange(0, time.shape[1] - rows, rows)
-    if not first.size:
-        return []
-    whole = np.all(np.lib.stride_tricks.sliding_window_view(there, rows + 1, axis=1), axis=-1)[:, first]
-    if whole.sum() < FEWEST:
-        return []
-    dq, dv, moved = ((x[:, first + rows] - x[:, first])[whole] for x in (q, v, travel))
-    bends = np.abs(v[:, 2:] - 2 * v[:, 1:-1] + v[:, :-2])[there[:, 2:] & there[:, 1:-1] & there[:, :-2]]
-    noise = 2.0 * (np.median(bends) / 0.6745) ** 2 / 6.0
-    columns, ahead = np.stack([dv, dq, np.ones_like(dv)], axis=1), dq - moved
-    kept = np.ones(len(dv), bool)
-    for _ in range(3):
-        slopes = np.linalg.lstsq(columns[kept], ahead[kept], rcond=None)[0]
-        left = ahead - columns @ slopes
-        kept = np.abs(left) <= 4.0 * np.median(np.abs(left)) / 0.6745
-    beside = columns[kept, 1:]
-    alone = dv[kept] - beside @ np.linalg.lstsq(beside, dv[kept], rcond=None)[0]
-    size = float(alone @ alone) - noise * kept.sum()
-    if size < 2.0 * noise * kept.sum() or size <= 0.0:
-        return []
-    sd = float(np.sqrt((left[kept] ** 2).sum() / (kept.sum() - 3) * (alone @ alone))) / size
-    return [(float(alone @ ahead[kept]) / size, sd)]
 
 
 def _with_runs(shots: Shots, runs: Float[np.ndarray, "windows nodes rows obs"]) -> Shots:

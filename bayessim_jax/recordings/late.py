@@ -1,0 +1,141 @@
+"""Velocities that come later than the positions that they belong to, as behind a filter.
+
+A velocity that is late by T is no velocity of the state that a simulation starts from, and no prediction fits it and
+the positions together. Over a piece of a recording
+
+    Δq − ∫ v dt = T Δv
+
+whatever moves the machine. Semi-implicit Euler, too, adds to a position the velocity at the end of each step h, and is
+late by h/2: that much a simulator's time step explains (`stepping`). What is later comes from a filter, which made it
+of the positions: without it nothing is lost that these do not hold.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+from jaxtyping import Bool, Float
+
+from bayessim_jax.recordings.states import slopes_between
+from bayessim_jax.recordings.windows import stack_windows
+from bayessim_jax.recordings.wording import Finding
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from bayessim_jax.recordings.layout import Layout
+    from bayessim_jax.recordings.recording import CaseRecording
+
+__all__ = ["BLUR", "find_late", "measure_lag", "without_velocities"]
+
+PIECE, FEWEST = 0.15, 30
+"""Seconds over which positions and velocities are compared, and how many such pieces it takes at least."""
+BLUR = 0.05
+"""Of the time step's own lag: standard deviation for what trapezoids leave of an integral."""
+SURE = 4.0
+"""Standard deviations by which a velocity has to be late."""
+VISIBLE = 0.1
+"""Of its noise: what the lag has to change of it."""
+STRETCH = 1.0
+"""Seconds of the windows that are looked at, at least."""
+
+
+def find_late(
+    recordings: Sequence[CaseRecording], layout: Layout, model: mujoco.MjModel, horizon: float
+) -> tuple[tuple[str, ...], list[Finding]]:
+    """Channels of velocities that are later than the model's time step explains, and a warning of each.
+
+    Hinges and slides only. A lag that changes a velocity by less than a tenth of its noise is none.
+    """
+    try:
+        windows = stack_windows(recordings, max(horizon, STRETCH))
+    except ValueError:
+        return (), []
+    late, found, own = [], [], 0.5 * float(model.opt.timestep)
+    explained = 0.0 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else own
+    for name, q, v in layout.single:
+        there = windows.qpos_measured[:, :, q] & windows.qvel_measured[:, :, v]
+        velocity = windows.qvel[:, :, v]
+        for lag, sd in measure_lag(windows.time, windows.qpos[:, :, q], velocity, there):
+            beyond, (moves, noise) = lag - explained, _changes(windows.time, velocity, there)
+            if beyond > SURE * np.hypot(sd, BLUR * own) and beyond * moves > VISIBLE * noise:
+                late.append(layout.qvel[v])
+                what = f"joint/{name}/qvel is {1e3 * lag:.2g} ms later than joint/{name}/qpos, as behind a filter"
+                remedy = "it is not used, velocities are taken from the positions; record it without a filter"
+                named = (r.name for r in recordings if r.qvel_measured[:, v].any())
+                found += [Finding("warning", file, what, remedy) for file in named]
+    return tuple(late), found
+
+
+def without_velocities(
+    recordings: Sequence[CaseRecording], layout: Layout, channels: Sequence[str]
+) -> tuple[CaseRecording, ...]:
+    """The same recordings with some velocities of hinges and slides taken from the positions."""
+    places = [(q, v) for _, q, v in layout.single if layout.qvel[v] in channels]
+
+    def free(r: CaseRecording) -> CaseRecording:
+        qvel, measured, known, halves = r.qvel.copy(), r.qvel_measured.copy(), r.known.copy(), list(r.half_widths)
+        for q, v in places:
+            slopes, halves[v] = slopes_between(r.time, r.qpos[:, q], r.qpos_measured[:, q], ~r.valid)
+            qvel[:, v], measured[:, v] = np.nan_to_num(slopes), False
+            known &= np.isfinite(slopes)
+        return dataclasses.replace(r, qvel=qvel, qvel_measured=measured, known=known, half_widths=tuple(halves))
+
+    return tuple(free(r) for r in recordings) if places else tuple(recordings)
+
+
+def measure_lag(
+    time: Float[np.ndarray, "windows rows"],
+    q: Float[np.ndarray, "windows rows"],
+    v: Float[np.ndarray, "windows rows"],
+    there: Bool[np.ndarray, "windows rows"],
+) -> list[tuple[float, float]]:
+    """By how many seconds of its own motion a joint's velocity is late, with a standard deviation, if that is told.
+
+    A regression of Δq − ∫ v dt, the integral by trapezoids, on Δv, and on Δq for scales that are off. The noise of Δv
+    makes a slope smaller; it is known from second differences. Pieces that lie far off, such as those of an impact
+    between two rows, are left out.
+    """
+    steps = np.diff(time, axis=1)
+    passed = np.cumsum(0.5 * (v[:, 1:] + v[:, :-1]) * steps, axis=1)
+    travel = np.concatenate([np.zeros((len(v), 1)), passed], axis=1)
+    rows = max(round(PIECE / float(np.median(steps[steps > 0]))), 2) if (steps > 0).any() else time.shape[1]
+    first = np.arange(0, time.shape[1] - rows, rows)
+    if not first.size:
+        return []
+    whole = np.all(np.lib.stride_tricks.sliding_window_view(there, rows + 1, axis=1), axis=-1)[:, first]
+    if whole.sum() < FEWEST:
+        return []
+    dq, dv, moved = ((x[:, first + rows] - x[:, first])[whole] for x in (q, v, travel))
+    noise = 2.0 * _noise(v, there) ** 2
+    columns, ahead = np.stack([dv, dq, np.ones_like(dv)], axis=1), dq - moved
+    kept = np.ones(len(dv), bool)
+    for _ in range(3):
+        slopes = np.linalg.lstsq(columns[kept], ahead[kept], rcond=None)[0]
+        left = ahead - columns @ slopes
+        kept = np.abs(left) <= 4.0 * np.median(np.abs(left)) / 0.6745
+    beside = columns[kept, 1:]
+    alone = dv[kept] - beside @ np.linalg.lstsq(beside, dv[kept], rcond=None)[0]
+    size = float(alone @ alone) - noise * kept.sum()
+    if size < 2.0 * noise * kept.sum() or size <= 0.0:
+        return []
+    sd = float(np.sqrt((left[kept] ** 2).sum() / (kept.sum() - 3) * (alone @ alone))) / size
+    return [(float(alone @ ahead[kept]) / size, sd)]
+
+
+def _changes(
+    time: Float[np.ndarray, "windows rows"], v: Float[np.ndarray, "windows rows"], there: Bool[np.ndarray, "..."]
+) -> tuple[float, float]:
+    """Root mean square of dv/dt, and the noise of v."""
+    noise, both = _noise(v, there), there[:, 1:] & there[:, :-1]
+    step = float(np.median(np.diff(time, axis=1)[both]))
+    return float(np.sqrt(max((np.diff(v, axis=1)[both] ** 2).mean() - 2.0 * noise**2, 0.0))) / step, noise
+
+
+def _noise(v: Float[np.ndarray, "windows rows"], there: Bool[np.ndarray, "windows rows"]) -> float:
+    """Standard deviation of white noise, from second differences, whatever jumps there are."""
+    bends = np.abs(v[:, 2:] - 2 * v[:, 1:-1] + v[:, :-2])[there[:, 2:] & there[:, 1:-1] & there[:, :-2]]
+    return float(np.median(bends)) / 0.6745 / np.sqrt(6.0)
