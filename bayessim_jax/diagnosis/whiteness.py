@@ -125,5 +125,33 @@ def judge_misfit(
     null = (draws.reshape(*left.shape, BOOTSTRAPS) + left[..., None]) ** 2
     null = np.moveaxis(null.sum(1), -1, 0)
     power, null = power * counts[:, None], null * counts[:, None]
-    p_value = (1 + (null.sum((1, 2)) >= power.sum()).sum()) / (1 + BOOTSTRAPS)
-    return Misfit(float(p_value), power - null.mean(0), noise, counts)
+    of_channels, mean = null.sum(1), null.mean(0)
+    extra = _doubt_of_noise(measured, cosines, mean.sum(0), counts)
+    usual = max(float(of_channels.sum(1).var()), 1e-30)
+    wide = np.sqrt(max(1.0 + float(extra.sum()) / usual, 0.0))
+    p_value = (1 + (wide * (of_channels.sum(1) - mean.sum()) >= power.sum() - mean.sum()).sum()) / (1 + BOOTSTRAPS)
+    return Misfit(float(p_value), power - mean, noise, counts)
+
+
+def _doubt_of_noise(
+    measured: Bool[np.ndarray, "windows rows obs"],
+    cosines: Float[np.ndarray, "modes rows"],
+    mean: Float[np.ndarray, " obs"],
+    counts: Bool[np.ndarray, " windows"],
+) -> Float[np.ndarray, " obs"]:
+    """What the variance of a channel's slow power P, of this mean, gains because noise is known from differences only.
+
+    In units of a noise with variance s² for 1, P/s² ≈ P − E[P] (s² − 1), so that the variance gains
+    E[P]² Var[s²] − 2 E[P] Cov[P, s²]. With P = rᵀ A r and s² = rᵀ B r of white r they are 2 tr(B²) and 2 tr(A B).
+    """
+    known = measured[:, :-2] & measured[:, 1:-1] & measured[:, 2:]
+    number = np.maximum(known.sum((0, 1)), 1)
+    beside = [(known[:, k:] & known[:, : known.shape[1] - k]).sum((0, 1)) for k in (1, 2)]
+    square = 36.0 * number + 32.0 * beside[0] + 2.0 * beside[1]
+    both = np.zeros(measured.shape[2])
+    for mode in cosines:
+        seen = np.where(measured, mode[:, None], 0.0)
+        bends = seen[:, :-2] - 2 * seen[:, 1:-1] + seen[:, 2:]
+        both += (np.where(known, bends, 0.0) ** 2)[counts].sum((0, 1))
+    gain = mean**2 * 2.0 * square / (6.0 * number) ** 2 - 2.0 * mean * 2.0 * both / (6.0 * number)
+    return np.where(known.sum((0, 1)) > 10, gain, 0.0)

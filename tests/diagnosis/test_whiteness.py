@@ -68,3 +68,22 @@ def test_windows_that_do_not_count_are_no_evidence_before_or_after():
     assert share_left(later, before) < 0.005
     assert every.p_value < 0.01 < later.p_value
     assert (later.excess[:5] == 0).all()
+
+
+@pytest.mark.parametrize(("windows", "rows"), [(40, 13), (20, 51)])
+def test_noise_that_few_differences_show_is_no_alarm(windows, rows):
+    """In short windows the noise is hardly better known than the slow power that is compared with it."""
+    rng, obs = np.random.default_rng(4), 4
+    slopes = np.zeros((obs, rows, obs))
+    slopes[np.arange(obs), :, np.arange(obs)] = np.linspace(0, 1, rows)
+    slopes = slopes.reshape(1, obs, rows * obs).repeat(windows, 0)
+    q, _ = np.linalg.qr(slopes[0].T)
+    measured, p_values = np.ones((windows, rows, obs), bool), []
+    for trial in range(200):
+        noise = rng.standard_normal((windows, rows * obs))
+        noise = (noise - noise @ q @ q.T).reshape(windows, rows, obs)
+        p_values.append(judge_misfit(jax.random.key(trial), noise, slopes, measured).p_value)
+    shares = [float(np.mean(np.array(p_values) < p)) for p in (0.05, 0.2, 0.5)]
+    assert shares[0] < 0.09  # 0.12 where the noise is taken for known
+    assert shares[1] < 0.28
+    assert shares[2] == pytest.approx(0.5, abs=0.15)
