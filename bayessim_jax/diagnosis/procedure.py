@@ -57,6 +57,8 @@ SCREENED = 30
 """Windows with which every candidate is tried at first."""
 FINALISTS, LEADERS, PAIRS = 7, 2, 4
 """Single effects that are simulated at most, at least, and pairs."""
+LOST = 0.8
+"""Share of the misfit that the best of them leaves along the motion, from where on their order there says nothing."""
 NEAR, ALIKE, VARIED = 0.75, 2, 2
 """Share of the best pair's gain from which pairs with other effects are simulated, so many with each, and in all."""
 RACED, PLACES = 40, 2
@@ -228,11 +230,12 @@ def name_effects(
     listed = [(screen.name(each.candidate), each.likelihood - nothing.score) for each in begun]
     if not ranked:
         return Diagnosis("unexplained", *detect(key, problem, _still(problem, start)), [])
-    singles = _finalists(screen, nothing, ranked)
-    work = _begin_work(key, problem, say)
-    none = _without(work, problem, detected)
     before = screen.misfit(key, nothing)
     remain = lambda found: share_left(screen.misfit(key, found), before)  # noqa: E731
+    lost = before.p_value >= FALSE_ALARMS or remain(ranked[0]) > LOST
+    singles = ranked if lost else _finalists(screen, nothing, ranked)
+    work = _begin_work(key, problem, say)
+    none = _without(work, problem, detected)
     finish = partial(_finish, work, none, remain, ahead=problem.ahead, thresholds=thresholds)
     entries = finish(singles)
     if entries and not go_on(work.bench, entries[0]):
@@ -931,8 +934,9 @@ def _enter(work: _Work, candidate: Candidate, fit: Fit, known: Float[np.ndarray,
 def _log_share(bench: Bench, candidate: Candidate, fit: Fit) -> float:
     """Log of the share of its prior that a candidate's numbers are found in, or those of the law without one of them.
 
-    A term whose sign is open and that is absent, a spring's cubic part for instance, is no coincidence: for the law
-    that has no such term the evidence is larger by the ratio of posterior to prior density at 0.
+    A term whose sign is open and that is absent, a spring's cubic part for instance, is no coincidence, nor is a factor
+    of 1, such as a resistance as it was believed beside the voltage that a motor induces: for the law that has neither
+    the evidence is larger by the ratio of posterior to prior density there.
 
     Source: Dickey 1971
     """
@@ -940,7 +944,8 @@ def _log_share(bench: Bench, candidate: Candidate, fit: Fit) -> float:
     variance, simpler = np.diagonal(np.linalg.inv(precision)), [0.0]
     for k, i in enumerate(bench.columns(candidate), bench.d):
         parameter = bench.parameters[i]
-        if parameter.low < 0.0 == parameter.neutral < parameter.high:
-            zero = float(bench.each[i].standard(0.0))
-            simpler.append(0.5 * (zero**2 - (z[k] - zero) ** 2 / variance[k] - np.log(variance[k])))
+        absent = parameter.neutral == (1.0 if parameter.log and not parameter.unit else 0.0)
+        if absent and parameter.low < parameter.neutral < parameter.high:
+            there = float(bench.each[i].standard(parameter.neutral))
+            simpler.append(0.5 * (there**2 - (z[k] - there) ** 2 / variance[k] - np.log(variance[k])))
     return float(max(simpler) - 0.5 * z @ z - 0.5 * np.linalg.slogdet(precision)[1])

@@ -394,3 +394,13 @@ def test_a_term_that_is_absent_is_no_coincidence(z, low, share):
     )
     fit = SimpleNamespace(z=np.array([z]), precision=np.array([[1e4]]))
     assert _log_share(bench, Candidate((0,)), fit) == pytest.approx(share, abs=1e-3)
+
+
+@pytest.mark.parametrize(("factor", "share"), [(1.0, 0.0), (1.05, -4.605)])
+def test_a_factor_of_one_is_no_coincidence(factor, share):
+    """A motor of the resistance that it was believed to have, and of another one."""
+    parameter = EffectParameter("resistance", "", 0.2, 5.0, 1.0, 1.05, log=True)
+    margin = margin_of_effect(parameter)
+    bench = SimpleNamespace(d=0, parameters=[parameter], each=[margin], columns=lambda candidate: [0])
+    fit = SimpleNamespace(z=np.array([float(margin.standard(factor))]), precision=np.array([[1e4]]))
+    assert _log_share(bench, Candidate((0,)), fit) == pytest.approx(share, abs=0.02)
