@@ -372,6 +372,7 @@ def _draw(seed: int) -> dict[str, Any]:
         "jitter": float(rng.choice([0.0, 0.0, 0.0, 0.1])),
         "integrator": str(rng.choice(["Euler", "RK4", "implicitfast"])),
         "timestep": float(rng.choice([0.001, 0.002, 0.005])),
+        "filter": float(rng.choice([0.0, 0.0, 0.005, 0.02])),
         "seed": seed,
     }
 
@@ -462,7 +463,7 @@ def _record(
     motor: Law | None,
     rng: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "rows nq"], Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nu"]]:
-    """One recording: what the machine did, and what its motors were told."""
+    """One recording: what the machine did, its velocities behind the sensors' filter, and what its motors were told."""
     period = 1.0 / case["rate"]
     held = max(1, math.ceil(period / STEP - 1e-9))
     model.opt.timestep = period / held
@@ -473,9 +474,11 @@ def _record(
     usual = np.array(machine.forces[:count])
     stiff = 3.0 * usual / machine.reach
     q, v, ctrl = np.zeros((len(time), model.nq)), np.zeros((len(time), model.nv)), np.zeros(wanted.shape)
+    filtered = np.zeros(model.nv)
+    share = 1.0 - math.exp(-model.opt.timestep / case["filter"]) if case["filter"] else 1.0
     for i in range(len(time)):
-        q[i], v[i] = data.qpos, data.qvel
-        place, rate = q[i, :count], v[i, :count]
+        q[i], v[i] = data.qpos, filtered
+        place, rate = q[i, :count], data.qvel[:count]
         if case["feedback"]:
             error = machine.reach * wanted[i] - place - 0.12 * rate
             ctrl[i] = np.clip(stiff * error, -4.0 * usual, 4.0 * usual)
@@ -492,6 +495,7 @@ def _record(
                 at = float(data.qpos[spot.joint]), float(data.qvel[spot.joint])
                 data.qfrc_applied[spot.joint] = law(*at, data.time)
             mujoco.mj_step(model, data)
+            filtered += share * (data.qvel - filtered)
     return q, v, ctrl
 
 

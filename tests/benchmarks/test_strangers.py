@@ -1,5 +1,7 @@
 """Machines simulated as a stranger would are cases, and hide what they say they hide."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ SHORT = {
     "jitter": 0.0,
     "velocities": True,
     "damped": False,
+    "filter": 0.0,
 }
 
 
@@ -41,3 +44,13 @@ def test_every_effect_is_at_a_place_of_the_library_and_seen_in_what_is_recorded(
     columns = [np.concatenate([r.qpos, r.qvel], 1) for each in (found, plain) for r in each.recordings]
     assert np.isfinite(columns[0]).all()
     assert sealed["parameters"] and not np.allclose(columns[0], columns[1], atol=1e-4)
+
+
+def test_filtered_velocities_are_late_by_the_filter(tmp_path):
+    settings = {"seconds": 8.0, "recordings": 2, "rate": 200}
+    case = of(draw_strangers(1, 5)[0], rig="arm", motion="sines", feedback=False, effects=[], **settings)
+    make_stranger(tmp_path / "case", case | {"filter": 0.005})
+    loaded = load_case(tmp_path / "case")
+    assert loaded.late == loaded.layout.qvel
+    lags = [float(re.search(r"is ([\d.]+) ms later", f.what)[1]) for f in loaded.findings if "later" in f.what]
+    np.testing.assert_allclose(lags, 5.0, rtol=0.1)
