@@ -39,8 +39,8 @@ SURE = 4.0
 """Standard deviations by which a velocity has to be late."""
 VISIBLE = 0.1
 """Of its noise: what the lag has to change of it."""
-STRETCH = 1.0
-"""Seconds of the windows that are looked at, at least."""
+STRETCH, SEEN = 1.0, 1_000_000
+"""Seconds of the windows that are looked at, at least, and rows of all recordings, at most."""
 
 
 def find_late(
@@ -50,8 +50,10 @@ def find_late(
 
     Hinges and slides only. A lag that changes a velocity by less than a tenth of its noise is none.
     """
+    if not any(r.qvel_measured.any() for r in recordings):
+        return (), []
     try:
-        windows = stack_windows(recordings, max(horizon, STRETCH))
+        windows = stack_windows(_first_rows(recordings), max(horizon, STRETCH))
     except ValueError:
         return (), []
     late, found, own = [], [], 0.5 * float(model.opt.timestep)
@@ -124,6 +126,16 @@ def measure_lag(
         return []
     sd = float(np.sqrt((left[kept] ** 2).sum() / (kept.sum() - 3) * (alone @ alone))) / size
     return [(float(alone @ ahead[kept]) / size, sd)]
+
+
+def _first_rows(recordings: Sequence[CaseRecording]) -> list[CaseRecording]:
+    """The recordings as far as they are looked at, an equal share of each at most."""
+    names = ("time", "ctrl", "qpos", "qvel", "sensors", "qpos_measured", "qvel_measured", "sensors_measured", "known")
+    count = SEEN // len(recordings)
+    return [
+        dataclasses.replace(r, valid=r.valid[: count - 1], **{name: getattr(r, name)[:count] for name in names})
+        for r in recordings
+    ]
 
 
 def _changes(
