@@ -140,7 +140,7 @@ def with_recordings(case: LoadedCase, pattern: str) -> LoadedCase:
             first = errors[0]
             raise CaseError(first.file, first.what, first.remedy, first.row)
         recordings.append(recording)
-    return dataclasses.replace(case, recordings=without_velocities(recordings, case.layout, case.late))
+    return dataclasses.replace(case, recordings=without_velocities(recordings, case.layout, case.lateness.channels))
 
 
 def read_table(path: Path) -> dict[str, Any]:

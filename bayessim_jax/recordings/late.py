@@ -6,8 +6,9 @@ the positions together. Over a piece of a recording
     Δq − ∫ v dt = T Δv
 
 whatever moves the machine. Semi-implicit Euler, too, adds to a position the velocity at the end of each step h, and is
-late by h/2: that much a simulator's time step explains (`stepping`). What is later comes from a filter, which made it
-of the positions: without it nothing is lost that these do not hold.
+late by h/2: that much a simulator's time step explains (`stepping`), also of recordings of a model that is believed to
+take steps of Runge and Kutta. What is later comes from a filter, which made it of the positions: without it nothing is
+lost that these do not hold.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from bayessim_jax.recordings.layout import Layout
     from bayessim_jax.recordings.recording import CaseRecording
 
-__all__ = ["BLUR", "find_late", "measure_lag", "without_velocities"]
+__all__ = ["BLUR", "Lateness", "find_late", "measure_lag", "without_velocities"]
 
 PIECE, FEWEST = 0.15, 30
 """Seconds over which positions and velocities are compared, and how many such pieces it takes at least."""
@@ -43,33 +44,43 @@ STRETCH, SEEN = 1.0, 1_000_000
 """Seconds of the windows that are looked at, at least, and rows of all recordings, at most."""
 
 
-def find_late(
-    recordings: Sequence[CaseRecording], layout: Layout, model: mujoco.MjModel, horizon: float
-) -> tuple[tuple[str, ...], list[Finding]]:
-    """Channels of velocities that are later than the model's time step explains, and a warning of each.
+@dataclasses.dataclass(frozen=True)
+class Lateness:
+    """What was found of a case's velocities."""
 
-    Hinges and slides only. A lag that changes a velocity by less than a tenth of its noise is none.
+    channels: tuple[str, ...] = ()
+    """Those that are later than a time step explains."""
+    stepped: bool = False
+    """Whether others are late as steps of semi-implicit Euler make them, and the model takes steps of another kind."""
+    findings: tuple[Finding, ...] = ()
+
+
+def find_late(recordings: Sequence[CaseRecording], layout: Layout, model: mujoco.MjModel, horizon: float) -> Lateness:
+    """Velocities of hinges and slides that come later than their positions, and a warning of those not to be used.
+
+    A lag that changes a velocity by less than a tenth of its noise is none.
     """
     if not any(r.qvel_measured.any() for r in recordings):
-        return (), []
+        return Lateness()
     try:
         windows = stack_windows(_first_rows(recordings), max(horizon, STRETCH))
     except ValueError:
-        return (), []
-    late, found, own = [], [], 0.5 * float(model.opt.timestep)
-    explained = 0.0 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else own
+        return Lateness()
+    late, found, stepped, own = [], [], False, 0.5 * float(model.opt.timestep)
     for name, q, v in layout.single:
         there = windows.qpos_measured[:, :, q] & windows.qvel_measured[:, :, v]
         velocity = windows.qvel[:, :, v]
         for lag, sd in measure_lag(windows.time, windows.qpos[:, :, q], velocity, there):
-            beyond, (moves, noise) = lag - explained, _changes(windows.time, velocity, there)
-            if beyond > SURE * np.hypot(sd, BLUR * own) and beyond * moves > VISIBLE * noise:
+            least, (moves, noise) = SURE * np.hypot(sd, BLUR * own), _changes(windows.time, velocity, there)
+            if lag - own > least and (lag - own) * moves > VISIBLE * noise:
                 late.append(layout.qvel[v])
                 what = f"joint/{name}/qvel is {1e3 * lag:.2g} ms later than joint/{name}/qpos, as behind a filter"
                 remedy = "it is not used, velocities are taken from the positions; record it without a filter"
                 named = (r.name for r in recordings if r.qvel_measured[:, v].any())
                 found += [Finding("warning", file, what, remedy) for file in named]
-    return tuple(late), found
+            elif lag > least and lag * moves > VISIBLE * noise:
+                stepped = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    return Lateness(tuple(late), stepped, tuple(found))
 
 
 def without_velocities(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from bayessim_jax.recordings.assemble import read_recording
 from bayessim_jax.recordings.augment import write_values
 from bayessim_jax.recordings.case import FILE, Case, read_case
-from bayessim_jax.recordings.late import find_late, without_velocities
+from bayessim_jax.recordings.late import Lateness, find_late, without_velocities
 from bayessim_jax.recordings.layout import Layout, layout_of_model, layout_of_system
 from bayessim_jax.recordings.mjcf import compile_spec, read_spec
 from bayessim_jax.recordings.parameters import Parameter, resolve_parameters
@@ -38,8 +38,8 @@ class LoadedCase:
     """The compiled `mujoco.MjModel` at its own values; None for a registered system."""
     spec: Any = field(default=None, repr=False)
     """The `mujoco.MjSpec` that it was compiled from."""
-    late: tuple[str, ...] = ()
-    """Velocities that are later than the positions, and not used."""
+    lateness: Lateness = Lateness()
+    """Velocities that are later than the positions."""
 
     @property
     def errors(self) -> list[Finding]:
@@ -104,13 +104,13 @@ def load_case(folder: str | Path, *, mask: bool = False) -> LoadedCase:
     if not _unnamed(case, layout):
         recordings, more = _recordings(case, layout)
         found += more
-    late: tuple[str, ...] = ()
+    lateness = Lateness()
     if model is not None and recordings:
-        late, more = find_late(recordings, layout, model, case.horizon)
-        recordings = without_velocities(recordings, layout, late)
-        found += more
+        lateness = find_late(recordings, layout, model, case.horizon)
+        recordings = without_velocities(recordings, layout, lateness.channels)
+        found += lateness.findings
     findings = tuple(_judge_holes(merge(found), mask))
-    return LoadedCase(case, layout, parameters, tuple(recordings), findings, model, spec, late)
+    return LoadedCase(case, layout, parameters, tuple(recordings), findings, model, spec, lateness)
 
 
 def _judge_holes(findings: list[Finding], mask: bool) -> list[Finding]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -258,8 +259,6 @@ def _coast(model: CaseModel, qpos: np.ndarray, moves: np.ndarray) -> np.ndarray:
 
 def _motions(model: Any, qpos: np.ndarray) -> np.ndarray:
     """Moves along every degree of freedom from the middle of a recording."""
-    import mujoco
-
     out = np.zeros((len(qpos), model.nv))
     for row in range(0, len(qpos), max(len(qpos) // 200, 1)):
         mujoco.mj_differentiatePos(model, out[row], 1.0, qpos[len(qpos) // 2], qpos[row])
@@ -304,6 +303,9 @@ def case_model(
         remarks.append(f"time step {dt / substeps:g} s instead of {spec.option.timestep:g} s, {substeps} to a row")
     substeps *= refined
     spec.option.timestep = dt / substeps
+    if case.lateness.stepped:
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+        remarks.append("semi-implicit Euler instead of Runge-Kutta: velocities are late as by its steps")
     layout = case.layout
     measured = {
         name

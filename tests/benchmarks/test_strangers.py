@@ -51,6 +51,6 @@ def test_filtered_velocities_are_late_by_the_filter(tmp_path):
     case = of(draw_strangers(1, 5)[0], rig="arm", motion="sines", feedback=False, effects=[], **settings)
     make_stranger(tmp_path / "case", case | {"filter": 0.005})
     loaded = load_case(tmp_path / "case")
-    assert loaded.late == loaded.layout.qvel
+    assert loaded.lateness.channels == loaded.layout.qvel
     lags = [float(re.search(r"is ([\d.]+) ms later", f.what)[1]) for f in loaded.findings if "later" in f.what]
     np.testing.assert_allclose(lags, 5.0, rtol=0.1)

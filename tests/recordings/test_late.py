@@ -4,11 +4,15 @@ import re
 import shutil
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
-from bayessim_jax.recordings.late import measure_lag
+from bayessim_jax.recordings.late import Lateness, measure_lag
 from bayessim_jax.recordings.loading import load_case
+from bayessim_jax.recordings.shots import case_model, split_windows
+from bayessim_jax.recordings.stepping import ratio_of_motion
+from benchmarks.strangers import STEP, draw_strangers, make_stranger
 from benchmarks.worlds import make_case
 
 TAU = 0.006
@@ -65,10 +69,10 @@ def test_the_lag_is_measured_whatever_the_scale(lag):
 
 def test_late_velocities_are_told_and_not_used(prompt, late):
     before, after = load_case(prompt), load_case(late)
-    assert before.late == ()
+    assert before.lateness.channels == ()
     assert not [f for f in before.findings if "later" in f.what]
     assert all(r.qvel_measured.all() for r in before.recordings)
-    assert after.late == after.layout.qvel
+    assert after.lateness.channels == after.layout.qvel
     assert not any(r.qvel_measured.any() for r in after.recordings)
     told = [str(f) for f in after.findings if "later" in f.what]
     assert len(told) == 1
@@ -101,3 +105,18 @@ def test_recordings_that_come_later_are_read_alike(late, prompt):
     case = load_case(late)
     more = with_recordings(case, str(prompt / "recordings" / "*.csv"))
     assert not any(r.qvel_measured.any() for r in more.recordings)
+
+
+def test_velocities_late_by_half_a_step_are_steps(tmp_path):
+    """Of a machine that was simulated by semi-implicit Euler, and is believed to be one of Runge and Kutta."""
+    drawn = draw_strangers(1, 5)[0] | {"rig": "arm", "group": "clean", "effects": [], "filter": 0.0, "jitter": 0.0}
+    case = drawn | {"seconds": 6.0, "recordings": 3, "rate": 100, "noise": 1e-4, "velocities": True, "timestep": 0.002}
+    for integrator, stepped in (("RK4", True), ("Euler", False)):
+        make_stranger(tmp_path / integrator, case | {"integrator": integrator})
+        loaded = load_case(tmp_path / integrator).check()
+        assert loaded.lateness == Lateness((), stepped)
+        model = case_model(loaded)
+        assert model.compiled.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+        assert any("instead of Runge-Kutta" in remark for remark in model.remarks) == stepped
+    s, sd = ratio_of_motion(model, split_windows(model)[0])
+    assert s == pytest.approx(STEP / 0.002, abs=3.0 * sd)
