@@ -298,6 +298,10 @@ def _settings(diagnosis: CaseDiagnosis, facts: Mapping[str, Any]) -> str:
         *[[str(k), str(v)] for k, v in facts.items() if isinstance(v, (str, int, float))],
     ]
     noise = zip(diagnosis.model.channels, diagnosis.result.best.misfit.noise, strict=True)
-    return html.table(["setting", "value"], rows) + html.details(
-        "Estimated noise", html.table(["channel", "standard deviation"], [[c, number(s, 4)] for c, s in noise])
+    return (
+        html.table(["setting", "value"], rows)
+        + html.details(
+            "Estimated noise", html.table(["channel", "standard deviation"], [[c, number(s, 4)] for c, s in noise])
+        )
+        + html.findings(facts.get("findings", []))
     )

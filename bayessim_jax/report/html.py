@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-__all__ = ["commands", "details", "figure", "figures", "notice", "page", "section", "table"]
+__all__ = ["commands", "details", "figure", "figures", "findings", "notice", "page", "section", "table"]
 
 CSS = """
 :root { --sans: system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif;
@@ -90,6 +90,11 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def details(summary: str, content: str) -> str:
     """Content that opens on a click."""
     return f"<details><summary>{escape(summary)}</summary>\n{content}\n</details>"
+
+
+def findings(lines: Sequence[str]) -> str:
+    """What was noticed in a case's files, folded; nothing where nothing was."""
+    return details("What was found in the case", table(["finding"], [[line] for line in lines])) if lines else ""
 
 
 def notice(text: str, *, good: bool = False) -> str:

@@ -209,9 +209,8 @@ def _settings(result: CaseInference, facts: Mapping[str, Any]) -> str:
         ["held out", ", ".join(result.held_out_names)],
         *[[str(k), str(v)] for k, v in facts.items() if isinstance(v, (str, int, float))],
     ]
-    findings = [[str(f)] for f in facts.get("findings", [])]
     return (
         html.table(["setting", "value"], rows)
         + html.details("Estimated noise", html.table(["channel", "standard deviation"], noise))
-        + (html.details("What was found in the case", html.table(["finding"], findings)) if findings else "")
+        + html.findings(facts.get("findings", []))
     )

@@ -2,6 +2,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from bayessim_jax.report import html
 from bayessim_jax.report.diagnose import _bent
 
 
@@ -27,3 +28,9 @@ def test_a_parameter_that_took_the_place_of_what_was_missing_is_told(before, aft
     found = warnings(before, after)
     assert [told in each and "&lt;mass&gt;" in each for each in found] == ([True] if told else [])
     assert warnings(before, after, names_something=False) == []
+
+
+def test_what_was_found_in_a_case_is_folded_and_escaped():
+    assert html.findings([]) == ""
+    shown = html.findings(["warning: <run>.csv: joint/hinge/qvel is 5 ms later than joint/hinge/qpos"])
+    assert "<details" in shown and "&lt;run&gt;.csv" in shown and "<run>" not in shown
