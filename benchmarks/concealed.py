@@ -449,10 +449,13 @@ def _coverage(rows: list[dict[str, Any]]) -> list[str]:
                     inside["effects"].append(abs(off) <= INSIDE * found["sd"])
     if not inside["augmented"]:
         return []
-    return [
+    lines = [
         f"90 % intervals hold the machine's own parameters in {np.mean(inside['augmented']):.0%} of "
         f"{len(inside['augmented'])} with the effect, {np.mean(inside['baseline']):.0%} without; median error "
-        f"{np.median(errors['augmented']):.2%} against {np.median(errors['baseline']):.2%}",
-        f"those of effects hold the world's in {np.mean(inside['effects']):.0%} of {len(inside['effects'])}; "
-        "its laws differ in form from the library's",
+        f"{np.median(errors['augmented']):.2%} against {np.median(errors['baseline']):.2%}"
     ]
+    if inside["effects"]:
+        share = np.mean(inside["effects"])
+        whose = f"those of effects hold the world's in {share:.0%} of {len(inside['effects'])}; "
+        lines.append(whose + "its laws differ in form from the library's")
+    return lines
