@@ -323,7 +323,7 @@ def decide(
     best = {tuple(entry.names): entry for entry in sorted(tied, key=lambda entry: entry.score)}
     fewest = min(map(len, best))
     least = [entry for names, entry in best.items() if len(names) == fewest]
-    least = [entry for entry in least if not any(_needs(other, entry, none, thresholds) for other in least)]
+    least = [entry for entry in least if not any(_shows_more(other, entry, none, thresholds) for other in least)]
     sets = [entry for entry in least if not any(has_special_case(entry, other) for other in least)]
     temper = thresholds.least / _resolution(entries[0], none, thresholds)
 
@@ -377,14 +377,14 @@ def _is_clearer(entry: Entry, best: Entry, none: Entry, thresholds: Thresholds) 
     return len(entry.names) <= len(best.names) and left > thresholds.form and its <= thresholds.clearer * left
 
 
-def _needs(entry: Entry, special: Entry, none: Entry, thresholds: Thresholds) -> bool:
-    """Whether a law explains far more than a special case of it, in pieces and ahead: that is not the finding then.
+def _shows_more(entry: Entry, rival: Entry, none: Entry, thresholds: Thresholds) -> bool:
+    """Whether a candidate explains far more than one that ties with it, in pieces and ahead: it is no rival then.
 
-    Where recordings are many, what tells them apart may be little of what both gain, and they tie.
+    Where recordings are many, what tells the two apart may be little of what both gain.
     """
-    left, its = share_left(entry.misfit, none.misfit), share_left(special.misfit, none.misfit)
+    left, its = share_left(entry.misfit, none.misfit), share_left(rival.misfit, none.misfit)
     clearer = its > thresholds.form and left <= thresholds.clearer * its
-    return clearer and entry.ahead <= thresholds.worth * special.ahead and has_special_case(entry, special)
+    return clearer and entry.ahead <= thresholds.worth * rival.ahead
 
 
 def _does_as_well(entry: Entry, other: Entry, none: Entry, thresholds: Thresholds) -> bool:

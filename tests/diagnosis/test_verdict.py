@@ -378,12 +378,13 @@ def test_a_tie_with_what_does_not_explain_is_no_confusion():
         (0.005, 0.002, "coulomb_friction@joint/a"),  # not ten times less
     ],
 )
-def test_a_law_that_shows_far_more_than_its_special_case_is_the_finding(left, ahead, told):
+def test_a_law_that_shows_far_more_than_its_rivals_is_the_finding(left, ahead, told):
     """Levels of friction that fall with speed, in many recordings: the scores differ by less than half a percent."""
     law = entry(["stribeck_friction@joint/a"], 1000.0, left, seed=1)
     special = entry(["coulomb_friction@joint/a"], 999.0, 0.013, seed=1)
-    law.ahead, special.ahead = ahead, 0.011
-    found = verdict(law, special)
+    sibling = entry(["asymmetric_friction@joint/a"], 999.0, 0.0128, seed=1)
+    law.ahead, special.ahead, sibling.ahead = ahead, 0.011, 0.011
+    found = verdict(law, special, sibling)
     assert found.verdict == "explained"
     assert found.best.names == [told]
 
