@@ -115,9 +115,9 @@ def measure_lag(
     steps = np.diff(time, axis=1)
     passed = np.cumsum(0.5 * (v[:, 1:] + v[:, :-1]) * steps, axis=1)
     travel = np.concatenate([np.zeros((len(v), 1)), passed], axis=1)
-    rows = max(round(PIECE / float(np.median(steps[steps > 0]))), 2) if (steps > 0).any() else time.shape[1]
-    first = np.arange(0, time.shape[1] - rows, rows)
-    if not first.size:
+    rows = round(PIECE / float(np.median(steps[steps > 0]))) if (steps > 0).any() else 0
+    first = np.arange(0, time.shape[1] - rows, max(rows, 1))
+    if rows < 2 or not first.size:
         return []
     whole = np.all(np.lib.stride_tricks.sliding_window_view(there, rows + 1, axis=1), axis=-1)[:, first]
     if whole.sum() < FEWEST:
