@@ -382,9 +382,7 @@ def _shows_more(entry: Entry, rival: Entry, none: Entry, thresholds: Thresholds)
 
     Where recordings are many, what tells the two apart may be little of what both gain.
     """
-    left, its = share_left(entry.misfit, none.misfit), share_left(rival.misfit, none.misfit)
-    clearer = its > thresholds.form and left <= thresholds.clearer * its
-    return clearer and entry.ahead <= thresholds.worth * rival.ahead
+    return _is_clearer(entry, rival, none, thresholds) and entry.ahead <= thresholds.worth * rival.ahead
 
 
 def _does_as_well(entry: Entry, other: Entry, none: Entry, thresholds: Thresholds) -> bool:

@@ -15,12 +15,14 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 
-__all__ = ["Misfit", "difference_noise", "judge_misfit"]
+__all__ = ["Misfit", "difference_noise", "judge_misfit", "second_differences"]
 
 MODES = 8
 """Cosines of a window that count as slow, beside the mean: a sensor or a base that is off shows there alone."""
 ROUNDED = 1e3
 """Times the precision of numbers: a column that is no longer beside the others is nothing but rounding."""
+FEW = 10
+"""Second differences that tell nothing of the noise."""
 BOOTSTRAPS = 400
 TINY = 1e-9
 """Of the noise's power: what is added where initial states can explain all of a cosine."""
@@ -46,12 +48,19 @@ class Misfit:
 
 def difference_noise(residual: Float[np.ndarray, "windows rows obs"], measured: Bool[np.ndarray, "..."]) -> np.ndarray:
     """Standard deviation of white noise: √(mean (r_t − 2 r_{t+1} + r_{t+2})² / 6), where three rows were measured."""
-    second = residual[:, :-2] - 2 * residual[:, 1:-1] + residual[:, 2:]
-    known = measured[:, :-2] & measured[:, 1:-1] & measured[:, 2:]
+    second, known = second_differences(residual, measured)
     counts = known.sum((0, 1))
     squares = np.where(known, second, 0.0) ** 2
     overall = np.sqrt((np.where(measured, residual, 0.0) ** 2).sum((0, 1)) / np.maximum(measured.sum((0, 1)), 1))
-    return np.where(counts > 10, np.sqrt(squares.sum((0, 1)) / np.maximum(6 * counts, 1)), overall)
+    return np.where(counts > FEW, np.sqrt(squares.sum((0, 1)) / np.maximum(6 * counts, 1)), overall)
+
+
+def second_differences(
+    x: Float[np.ndarray, "windows rows ..."], measured: Bool[np.ndarray, "windows rows ..."]
+) -> tuple[Float[np.ndarray, "windows rows-2 ..."], Bool[np.ndarray, "windows rows-2 ..."]]:
+    """x_t − 2 x_{t+1} + x_{t+2} along the rows, and where all three were measured."""
+    known = measured[:, :-2] & measured[:, 1:-1] & measured[:, 2:]
+    return x[:, :-2] - 2 * x[:, 1:-1] + x[:, 2:], known
 
 
 def _cosines(rows: int) -> Float[np.ndarray, "modes rows"]:
@@ -125,11 +134,11 @@ def judge_misfit(
     null = (draws.reshape(*left.shape, BOOTSTRAPS) + left[..., None]) ** 2
     null = np.moveaxis(null.sum(1), -1, 0)
     power, null = power * counts[:, None], null * counts[:, None]
-    of_channels, mean = null.sum(1), null.mean(0)
-    extra = _doubt_of_noise(measured, cosines, mean.sum(0), counts)
-    usual = max(float(of_channels.sum(1).var()), 1e-30)
-    wide = np.sqrt(max(1.0 + float(extra.sum()) / usual, 0.0))
-    p_value = (1 + (wide * (of_channels.sum(1) - mean.sum()) >= power.sum() - mean.sum()).sum()) / (1 + BOOTSTRAPS)
+    total, mean = null.sum((1, 2)), null.mean(0)
+    gain = _doubt_of_noise(measured, cosines, mean.sum(0), counts)
+    wide = np.sqrt(max(1.0 + gain / max(float(total.var()), 1e-30), 0.0))
+    total = total.mean() + wide * (total - total.mean())
+    p_value = (1 + (total >= power.sum()).sum()) / (1 + BOOTSTRAPS)
     return Misfit(float(p_value), power - mean, noise, counts)
 
 
@@ -138,20 +147,17 @@ def _doubt_of_noise(
     cosines: Float[np.ndarray, "modes rows"],
     mean: Float[np.ndarray, " obs"],
     counts: Bool[np.ndarray, " windows"],
-) -> Float[np.ndarray, " obs"]:
-    """What the variance of a channel's slow power P, of this mean, gains because noise is known from differences only.
+) -> float:
+    """What the variance of the slow power, of this mean in each channel, gains as differences alone tell the noise.
 
-    In units of a noise with variance s² for 1, P/s² ≈ P − E[P] (s² − 1), so that the variance gains
-    E[P]² Var[s²] − 2 E[P] Cov[P, s²]. With P = rᵀ A r and s² = rᵀ B r of white r they are 2 tr(B²) and 2 tr(A B).
+    For the power P of one channel, in units of a noise with variance s² for 1, P/s² ≈ P − E[P] (s² − 1): the variance
+    gains E[P]² Var[s²] − 2 E[P] Cov[P, s²]. With P = rᵀ A r and s² = rᵀ B r of white r they are 2 tr(B²) and 2 tr(A B).
     """
-    known = measured[:, :-2] & measured[:, 1:-1] & measured[:, 2:]
+    waves = np.where(measured[..., None], cosines.T[:, None], 0.0)
+    bends, there = second_differences(waves, measured[..., None])
+    both, known = (np.where(there, bends, 0.0)[counts] ** 2).sum((0, 1, 3)), there[..., 0]
     number = np.maximum(known.sum((0, 1)), 1)
     beside = [(known[:, k:] & known[:, : known.shape[1] - k]).sum((0, 1)) for k in (1, 2)]
     square = 36.0 * number + 32.0 * beside[0] + 2.0 * beside[1]
-    both = np.zeros(measured.shape[2])
-    for mode in cosines:
-        seen = np.where(measured, mode[:, None], 0.0)
-        bends = seen[:, :-2] - 2 * seen[:, 1:-1] + seen[:, 2:]
-        both += (np.where(known, bends, 0.0) ** 2)[counts].sum((0, 1))
     gain = mean**2 * 2.0 * square / (6.0 * number) ** 2 - 2.0 * mean * 2.0 * both / (6.0 * number)
-    return np.where(known.sum((0, 1)) > 10, gain, 0.0)
+    return float(gain[known.sum((0, 1)) > FEW].sum())

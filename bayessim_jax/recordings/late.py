@@ -20,6 +20,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
 
+from bayessim_jax.diagnosis.whiteness import second_differences
 from bayessim_jax.recordings.states import slopes_between
 from bayessim_jax.recordings.windows import stack_windows
 from bayessim_jax.recordings.wording import Finding
@@ -52,20 +53,21 @@ class Lateness:
     """Those that are later than a time step explains."""
     stepped: bool = False
     """Whether others are late as steps of semi-implicit Euler make them, and the model takes steps of another kind."""
-    findings: tuple[Finding, ...] = ()
 
 
-def find_late(recordings: Sequence[CaseRecording], layout: Layout, model: mujoco.MjModel, horizon: float) -> Lateness:
+def find_late(
+    recordings: Sequence[CaseRecording], layout: Layout, model: mujoco.MjModel, horizon: float
+) -> tuple[Lateness, list[Finding]]:
     """Velocities of hinges and slides that come later than their positions, and a warning of those not to be used.
 
     A lag that changes a velocity by less than a tenth of its noise is none.
     """
     if not any(r.qvel_measured.any() for r in recordings):
-        return Lateness()
+        return Lateness(), []
     try:
         windows = stack_windows(_first_rows(recordings), max(horizon, STRETCH))
     except ValueError:
-        return Lateness()
+        return Lateness(), []
     late, found, stepped, own = [], [], False, 0.5 * float(model.opt.timestep)
     for name, q, v in layout.single:
         there = windows.qpos_measured[:, :, q] & windows.qvel_measured[:, :, v]
@@ -80,7 +82,7 @@ def find_late(recordings: Sequence[CaseRecording], layout: Layout, model: mujoco
                 found += [Finding("warning", file, what, remedy) for file in named]
             elif lag > least and lag * moves > VISIBLE * noise:
                 stepped = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-    return Lateness(tuple(late), stepped, tuple(found))
+    return Lateness(tuple(late), stepped), found
 
 
 def without_velocities(
@@ -160,5 +162,5 @@ def _changes(
 
 def _noise(v: Float[np.ndarray, "windows rows"], there: Bool[np.ndarray, "windows rows"]) -> float:
     """Standard deviation of white noise, from second differences, whatever jumps there are."""
-    bends = np.abs(v[:, 2:] - 2 * v[:, 1:-1] + v[:, :-2])[there[:, 2:] & there[:, 1:-1] & there[:, :-2]]
-    return float(np.median(bends)) / 0.6745 / np.sqrt(6.0)
+    bends, known = second_differences(v, there)
+    return float(np.median(np.abs(bends[known]))) / 0.6745 / np.sqrt(6.0)

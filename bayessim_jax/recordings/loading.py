@@ -106,9 +106,9 @@ def load_case(folder: str | Path, *, mask: bool = False) -> LoadedCase:
         found += more
     lateness = Lateness()
     if model is not None and recordings:
-        lateness = find_late(recordings, layout, model, case.horizon)
+        lateness, more = find_late(recordings, layout, model, case.horizon)
         recordings = without_velocities(recordings, layout, lateness.channels)
-        found += lateness.findings
+        found += more
     findings = tuple(_judge_holes(merge(found), mask))
     return LoadedCase(case, layout, parameters, tuple(recordings), findings, model, spec, lateness)
 
