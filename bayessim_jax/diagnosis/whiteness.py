@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 
-__all__ = ["Misfit", "difference_noise", "judge_misfit", "second_differences"]
+__all__ = ["Misfit", "difference_noise", "judge_misfit"]
 
 MODES = 8
 """Cosines of a window that count as slow, beside the mean: a sensor or a base that is off shows there alone."""
@@ -48,14 +48,14 @@ class Misfit:
 
 def difference_noise(residual: Float[np.ndarray, "windows rows obs"], measured: Bool[np.ndarray, "..."]) -> np.ndarray:
     """Standard deviation of white noise: √(mean (r_t − 2 r_{t+1} + r_{t+2})² / 6), where three rows were measured."""
-    second, known = second_differences(residual, measured)
+    second, known = _second_differences(residual, measured)
     counts = known.sum((0, 1))
     squares = np.where(known, second, 0.0) ** 2
     overall = np.sqrt((np.where(measured, residual, 0.0) ** 2).sum((0, 1)) / np.maximum(measured.sum((0, 1)), 1))
     return np.where(counts > FEW, np.sqrt(squares.sum((0, 1)) / np.maximum(6 * counts, 1)), overall)
 
 
-def second_differences(
+def _second_differences(
     x: Float[np.ndarray, "windows rows ..."], measured: Bool[np.ndarray, "windows rows ..."]
 ) -> tuple[Float[np.ndarray, "windows rows-2 ..."], Bool[np.ndarray, "windows rows-2 ..."]]:
     """x_t − 2 x_{t+1} + x_{t+2} along the rows, and where all three were measured."""
@@ -154,7 +154,7 @@ def _doubt_of_noise(
     gains E[P]² Var[s²] − 2 E[P] Cov[P, s²]. With P = rᵀ A r and s² = rᵀ B r of white r they are 2 tr(B²) and 2 tr(A B).
     """
     waves = np.where(measured[..., None], cosines.T[:, None], 0.0)
-    bends, there = second_differences(waves, measured[..., None])
+    bends, there = _second_differences(waves, measured[..., None])
     both, known = (np.where(there, bends, 0.0)[counts] ** 2).sum((0, 1, 3)), there[..., 0]
     number = np.maximum(known.sum((0, 1)), 1)
     beside = [(known[:, k:] & known[:, : known.shape[1] - k]).sum((0, 1)) for k in (1, 2)]
