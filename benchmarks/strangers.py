@@ -6,7 +6,6 @@ Nothing is shared with `bayessim conceal`: neither machines nor laws, motions or
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,31 +14,19 @@ import numpy as np
 from jaxtyping import Float
 
 from bayessim_jax.concealment import UNKNOWN
-from benchmarks.concealed import diagnose_all
+from benchmarks.concealed import ONE_LAW, diagnose_all
+from benchmarks.textbook import COMMANDS, EDITS, ELASTIC, FORCES, GRAVITY, TWO_JOINTS, Law, Moment, Spot
 
 if TYPE_CHECKING:
     from argparse import Namespace
-    from collections.abc import Callable
     from pathlib import Path
 
-    Law = Callable[[float, float, float], float]
+__all__ = ["MACHINES", "READINGS", "diagnose_strangers", "draw_strangers", "make_stranger"]
 
-__all__ = [
-    "COMMANDS",
-    "EDITS",
-    "FORCES",
-    "MACHINES",
-    "READINGS",
-    "diagnose_strangers",
-    "draw_strangers",
-    "make_stranger",
-]
-
-GROUPS = {"single": 0.65, "unknown": 0.25, "clean": 0.1}
-"""Shares of the machines: one effect, one of no library, none."""
+GROUPS = {"single": 0.5, "pair": 0.15, "unknown": 0.2, "clean": 0.15}
+"""Shares of the machines: one effect, two, one of no library, none."""
 STEP, INTEGRATOR = 5e-4, "implicitfast"
 """s, the longest time step of a machine, and how it is stepped."""
-GRAVITY = 9.81
 
 
 @dataclass(frozen=True)
@@ -126,211 +113,21 @@ def _arm(rng: np.random.Generator) -> Machine:
 MACHINES = {"pendulum": _pendulum, "carriage": _carriage, "lift": _lift, "crane": _crane, "arm": _arm}
 
 
-@dataclass(frozen=True)
-class Spot:
-    """Where an effect is, and how strong."""
-
-    joint: int
-    size: float
-    """Share of the force there."""
-    force: float
-    speed: float
-    reach: float
-    seconds: float
-    """Of a recording."""
-
-
-def _viscous(model: mujoco.MjModel, spot: Spot, rng: np.random.Generator) -> None:
-    model.dof_damping[spot.joint] += spot.size * spot.force / spot.speed
-
-
-def _coulomb(model: mujoco.MjModel, spot: Spot, rng: np.random.Generator) -> None:
-    model.dof_frictionloss[spot.joint] += 0.7 * spot.size * spot.force
-
-
-def _rotor(model: mujoco.MjModel, spot: Spot, rng: np.random.Generator) -> None:
-    data, inertia = mujoco.MjData(model), np.zeros((model.nv, model.nv))
-    mujoco.mj_forward(model, data)
-    mujoco.mj_fullM(model, data, inertia)
-    model.dof_armature[spot.joint] += spot.size * inertia[spot.joint, spot.joint]
-
-
-def _spring(model: mujoco.MjModel, spot: Spot, rng: np.random.Generator) -> None:
-    model.jnt_stiffness[spot.joint] = spot.size * spot.force / spot.reach
-    model.qpos_spring[spot.joint] = 0.25 * spot.reach * rng.uniform(-1.0, 1.0)
-
-
-def _tilt(model: mujoco.MjModel, spot: Spot, rng: np.random.Generator) -> None:
-    angle = rng.uniform(0.08, 0.25) * rng.choice([-1.0, 1.0])
-    model.opt.gravity[:] = GRAVITY * math.sin(angle), 0.0, -GRAVITY * math.cos(angle)
-
-
-def _payload(model: mujoco.MjModel, spot: Spot, rng: np.random.Generator) -> None:
-    """A point at the end of the last rod; the long axis of a rod's inertia is its third."""
-    last, add = model.nbody - 1, 1.5 * spot.size * model.body_mass[model.nbody - 1]
-    mass, middle = model.body_mass[last], model.body_ipos[last, 2]
-    centre = (mass * middle + add * 2.0 * middle) / (mass + add)
-    model.body_inertia[last, :2] += mass * (middle - centre) ** 2 + add * (2.0 * middle - centre) ** 2
-    model.body_mass[last], model.body_ipos[last, 2] = mass + add, centre
-
-
-EDITS = {
-    "viscous_friction": _viscous,
-    "coulomb_friction": _coulomb,
-    "armature": _rotor,
-    "joint_spring": _spring,
-    "base_tilt": _tilt,
-    "payload": _payload,
-}
-"""What MuJoCo itself simulates."""
-
-
-def _rubbing(level: Callable[[float], float], width: float) -> Law:
-    return lambda q, v, t: -level(v) * math.tanh(v / width)
-
-
-def _stribeck(spot: Spot, rng: np.random.Generator) -> Law:
-    force = 0.5 * spot.size * spot.force
-    return _rubbing(lambda v: force + force * math.exp(-((v / (0.08 * spot.speed)) ** 2)), 0.004 * spot.speed)
-
-
-def _uneven(spot: Spot, rng: np.random.Generator) -> Law:
-    force = 0.7 * spot.size * spot.force
-    return _rubbing(lambda v: force if v > 0.0 else 0.4 * force, 0.004 * spot.speed)
-
-
-def _drag(spot: Spot, rng: np.random.Generator) -> Law:
-    c = 1.5 * spot.size * spot.force / spot.speed**2
-    return lambda q, v, t: -c * v * abs(v)
-
-
-def _ripple(spot: Spot, rng: np.random.Generator) -> Law:
-    waves, phase = rng.integers(4, 10) / spot.reach, rng.uniform(0.0, 2.0 * math.pi)
-    return lambda q, v, t: 0.7 * spot.size * spot.force * math.sin(waves * q + phase)
-
-
-def _hum(spot: Spot, rng: np.random.Generator) -> Law:
-    phase = rng.uniform(0.0, 2.0 * math.pi)
-    return lambda q, v, t: 0.7 * spot.size * spot.force * math.sin(2.0 * math.pi * 3.3 * t + phase)
-
-
-def _patchy(spot: Spot, rng: np.random.Generator) -> Law:
-    phase, force = rng.uniform(0.0, 2.0 * math.pi), spot.size * spot.force
-    rough = lambda q: math.sin(6.0 * q / spot.reach + phase) > 0.3  # noqa: E731
-    return lambda q, v, t: -force * rough(q) * math.tanh(v / (0.01 * spot.speed))
-
-
-def _detent(spot: Spot, rng: np.random.Generator) -> Law:
-    phase, force = rng.uniform(0.0, 2.0 * math.pi), 0.8 * spot.size * spot.force
-    return lambda q, v, t: -force * math.sin(2.5 * q / spot.reach + phase) * math.exp(-((v / (0.2 * spot.speed)) ** 2))
-
-
-def _fading(spot: Spot, rng: np.random.Generator) -> Law:
-    c = spot.size * spot.force / spot.speed
-    return lambda q, v, t: -c * v * (1.0 + math.cos(2.0 * math.pi * t / 3.0))
-
-
-def _gusts(spot: Spot, rng: np.random.Generator) -> Law:
-    pushes = rng.normal(size=4096)
-    return lambda q, v, t: 0.5 * spot.size * spot.force * pushes[int(t / 0.25) % len(pushes)]
-
-
-FORCES = {
-    "stribeck_friction": _stribeck,
-    "asymmetric_friction": _uneven,
-    "quadratic_drag": _drag,
-    "torque_ripple": _ripple,
-    f"{UNKNOWN}hum": _hum,
-    f"{UNKNOWN}patchy": _patchy,
-    f"{UNKNOWN}detent": _detent,
-    f"{UNKNOWN}fading": _fading,
-    f"{UNKNOWN}gusts": _gusts,
-}
-"""Forces on a joint of its position, its velocity and time."""
-
-
-def _always(change: Callable[[float, float, float], float]) -> Callable[[], Law]:
-    return lambda: change
-
-
-def _gain(spot: Spot, rng: np.random.Generator) -> Callable[[], Law]:
-    gain = 1.0 + spot.size * rng.choice([-1.0, 1.0])
-    return _always(lambda u, v, t: gain * u)
-
-
-def _bias(spot: Spot, rng: np.random.Generator) -> Callable[[], Law]:
-    return _always(lambda u, v, t: u + 0.5 * spot.size * spot.force)
-
-
-def _deadband(spot: Spot, rng: np.random.Generator) -> Callable[[], Law]:
-    width = 0.5 * spot.size * spot.force
-    return _always(lambda u, v, t: math.copysign(max(abs(u) - width, 0.0), u))
-
-
-def _saturation(spot: Spot, rng: np.random.Generator) -> Callable[[], Law]:
-    limit = rng.uniform(0.35, 0.7) * spot.force
-    return _always(lambda u, v, t: float(np.clip(u, -limit, limit)))
-
-
-def _drift(spot: Spot, rng: np.random.Generator) -> Callable[[], Law]:
-    rate = rng.uniform(0.03, 0.08)
-    return _always(lambda u, v, t: u * (1.0 - rate * t))
-
-
-def _drop(spot: Spot, rng: np.random.Generator) -> Callable[[], Law]:
-    when, gain = rng.uniform(0.3, 0.7) * spot.seconds, rng.uniform(0.4, 0.75)
-    return _always(lambda u, v, t: u * (gain if t > when else 1.0))
-
-
-def _back_emf(spot: Spot, rng: np.random.Generator) -> Callable[[], Law]:
-    return _always(lambda u, v, t: u - spot.size * spot.force / spot.speed * v)
-
-
-def _late(spot: Spot, rng: np.random.Generator) -> Callable[[], Law]:
-    count = round(rng.uniform(0.02, 0.06) / STEP)
-
-    def begin() -> Law:
-        queue: deque[float] = deque(maxlen=count + 1)
-        return lambda u, v, t: (queue.append(u), queue[0])[1]
-
-    return begin
-
-
-def _slow(spot: Spot, rng: np.random.Generator) -> Callable[[], Law]:
-    share = 1.0 - math.exp(-STEP / rng.uniform(0.03, 0.12))
-    return lambda: _Following(lambda arrived, u: arrived + share * (u - arrived))
-
-
-def _limited(spot: Spot, rng: np.random.Generator) -> Callable[[], Law]:
-    most = rng.uniform(2.0, 6.0) * spot.force * STEP
-    return lambda: _Following(lambda arrived, u: arrived + float(np.clip(u - arrived, -most, most)))
-
-
-class _Following:
-    """What arrives of a command, beginning with the first one."""
-
-    def __init__(self, follow: Callable[[float, float], float]) -> None:
-        self.follow, self.arrived = follow, None
-
-    def __call__(self, u: float, v: float, t: float) -> float:
-        self.arrived = u if self.arrived is None else self.follow(self.arrived, u)
-        return self.arrived
-
-
-COMMANDS = {
-    "actuator_gain": _gain,
-    "actuator_bias": _bias,
-    "actuator_deadband": _deadband,
-    "actuator_saturation": _saturation,
-    "actuator_rate_limit": _limited,
-    "actuator_delay": _late,
-    "actuator_lag": _slow,
-    "gain_drift": _drift,
-    "gain_drop": _drop,
-    "back_emf": _back_emf,
-}
-"""What becomes of a command, of the joint's velocity and time; a new one for every recording."""
 READINGS = ("sensor_offset", "sensor_scale", "sensor_delay")
+ALIKE = (
+    *ONE_LAW,
+    {"coulomb_friction", "stribeck_friction", "asymmetric_friction", "load_dependent_friction", "lugre_friction"},
+    {"lugre_friction", "hysteresis"},
+    {"actuator_delay", "actuator_lag", "actuator_rate_limit", "sensor_delay"},
+    {"actuator_gain", "gain_drift", "gain_drop", "actuator_saturation"},
+    {"joint_flexibility", "backlash", "armature"},
+)
+"""Effects of which two are not drawn together: they are one of them, or a third, with other numbers."""
+NOT_SEEN = {
+    "carriage": {"base_tilt", "payload", "link_offset", "sensor_offset"},
+    "lift": {"base_tilt", "payload", "link_offset", "sensor_offset", "actuator_saturation", "backlash"},
+}
+"""What moves nothing on a machine; a motor that cannot hold its weight is no lift's, whose weight closes every gap."""
 
 
 def diagnose_strangers(options: Namespace) -> None:
@@ -347,14 +144,16 @@ def _draw(seed: int) -> dict[str, Any]:
     rng = np.random.default_rng(seed)
     group = str(rng.choice(list(GROUPS), p=list(GROUPS.values())))
     rig = str(rng.choice(list(MACHINES)))
-    names = [*EDITS, *COMMANDS, *READINGS, *(name for name in FORCES if not name.startswith(UNKNOWN))]
-    if rig in ("carriage", "lift"):
-        names = [name for name in names if name not in ("base_tilt", "payload", "sensor_offset")]
-    if rig == "lift":
-        names.remove("actuator_saturation")  # a motor that cannot hold the weight is no lift's
+    known = [*EDITS, *COMMANDS, *READINGS, *(name for name in FORCES if not name.startswith(UNKNOWN))]
+    names = [name for name in known if name not in NOT_SEEN.get(rig, ())]
+    if rig not in ("crane", "arm"):
+        names = [name for name in names if name not in TWO_JOINTS]
     if group == "unknown":
         names = [name for name in FORCES if name.startswith(UNKNOWN)]
     effects = [str(rng.choice(names))] if group != "clean" else []
+    if group == "pair":
+        alike = set(effects).union(*(law for law in ALIKE if effects[0] in law))
+        effects.append(str(rng.choice([name for name in names if name not in alike])))
     apart = {"viscous_friction", "back_emf"}.isdisjoint(effects)
     return {
         "rig": rig,
@@ -392,12 +191,6 @@ def make_stranger(folder: Path, case: dict[str, Any]) -> dict[str, Any]:
     """Write a case that was drawn; returns what is hidden in it."""
     build, hide, move = np.random.default_rng(case["seed"] + 1).spawn(3)
     machine = MACHINES[case["rig"]](build)
-    name = case["effects"][0] if case["effects"] else ""
-    joint = int(hide.integers(len(machine.motors if name in COMMANDS else machine.joints)))
-    if name == "sensor_offset":
-        joint = len(machine.joints) - 1  # where a rail begins is nobody's business
-    scale = machine.forces[joint], machine.speeds[joint], machine.reach
-    spot = Spot(joint, case["size"], *scale, case["seconds"])
     model = mujoco.MjModel.from_xml_string(machine.mjcf(INTEGRATOR, STEP))
     body = model.body(machine.body).id
     believed, factor = float(model.body_mass[body]), build.uniform(0.85, 1.2)
@@ -409,22 +202,27 @@ def make_stranger(folder: Path, case: dict[str, Any]) -> dict[str, Any]:
         damping = build.uniform(0.05, 0.3) * machine.forces[j] / machine.speeds[j]
         model.dof_damping[j], truth[f"{known}_damping"] = damping, damping
         unknown.append((f"{known}_damping", f"joint/{known}/damping", 0.0, 4.0 * damping))
-    if name in EDITS:
-        EDITS[name](model, spot, hide)
+    spots = [(name, _spot(name, machine, model, case, hide)) for name in case["effects"]]
+    for name, spot in spots:
+        if name in EDITS:
+            EDITS[name](model, spot, hide)
     mujoco.mj_setConst(model, mujoco.MjData(model))
-    law = FORCES[name](spot, hide) if name in FORCES else None
-    begin = COMMANDS[name](spot, hide) if name in COMMANDS else None
-    offset, scaled = spot.reach * hide.uniform(0.05, 0.2), 1.0 + 0.3 * case["size"]
-    late = max(1, round(0.02 * case["rate"])) if name == "sensor_delay" else 0
+    forces = [(spot.joint, FORCES[name](spot, hide)) for name, spot in spots if name in FORCES]
+    commanded = sorted((each for each in spots if each[0] in COMMANDS), key=lambda each: each[0] in ELASTIC)
+    motors = [(spot.joint, COMMANDS[name](spot, hide)) for name, spot in commanded]
+    offset, scaled = machine.reach * hide.uniform(0.05, 0.2), 1.0 + 0.3 * case["size"]
+    late = max(1, round(0.02 * case["rate"]))
     (folder / "recordings").mkdir(parents=True)
     for k in range(case["recordings"]):
-        q, v, ctrl = _record(model, machine, case, spot, law, begin() if begin else None, move)
-        if late:
-            q[:, joint] = np.concatenate([np.full(late, q[0, joint]), q[:-late, joint]])
-        if name == "sensor_offset":
-            q[:, joint] += offset
-        if name == "sensor_scale":
-            q[:, joint] *= scaled
+        laws = [[(j, begin()) for j, begin in each] for each in (motors, forces)]
+        q, v, ctrl = _record(model, machine, case, laws[0], laws[1], move)
+        for name, spot in spots:
+            if name == "sensor_delay":
+                q[:, spot.joint] = np.concatenate([np.full(late, q[0, spot.joint]), q[:-late, spot.joint]])
+            if name == "sensor_offset":
+                q[:, spot.joint] += offset
+            if name == "sensor_scale":
+                q[:, spot.joint] *= scaled
         _write_recording(folder / "recordings" / f"run{k + 1}.csv", machine, case, q, v, ctrl, move)
     (folder / "model.xml").write_text(machine.mjcf(case["integrator"], case["timestep"]), encoding="utf-8")
     lines = [
@@ -437,9 +235,26 @@ def make_stranger(folder: Path, case: dict[str, Any]) -> dict[str, Any]:
         prior = f'{{ distribution = "uniform", low = {low!r}, high = {high!r} }}'
         lines += ["", "[[parameters]]", f'name = "{parameter}"', f'targets = ["{target}"]', f"prior = {prior}"]
     (folder / "case.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    place, moved = _place(name, machine, joint)
-    hidden = {"effect": name, "at": place, "joint": moved, "strength": {"measured": case["size"]}, "parameters": {}}
-    return {"effects": [hidden] if name else [], "parameters": truth}
+    return {"effects": [_sealed(name, machine, spot) for name, spot in spots], "parameters": truth}
+
+
+def _spot(name: str, machine: Machine, model: mujoco.MjModel, case: dict[str, Any], rng: np.random.Generator) -> Spot:
+    """Where an effect is, at random."""
+    driven = name in COMMANDS or name == "load_dependent_friction"
+    joint = int(rng.integers(len(machine.motors if driven else machine.joints)))
+    if name == "sensor_offset":
+        joint = len(machine.joints) - 1  # where a rail begins is nobody's business
+    data, inertia = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, inertia)
+    scale = machine.forces[joint], machine.speeds[joint], machine.reach
+    return Spot(joint, case["size"], *scale, case["seconds"], float(inertia[joint, joint]))
+
+
+def _sealed(name: str, machine: Machine, spot: Spot) -> dict[str, Any]:
+    """What is hidden."""
+    place, moved = _place(name, machine, spot.joint)
+    return {"effect": name, "at": place, "joint": moved, "strength": {"measured": spot.size}, "parameters": {}}
 
 
 def _place(name: str, machine: Machine, joint: int) -> tuple[str, str | None]:
@@ -447,9 +262,9 @@ def _place(name: str, machine: Machine, joint: int) -> tuple[str, str | None]:
     at = f"joint/{machine.joints[joint]}"
     if name == "base_tilt":
         return "world", None
-    if name == "payload":
+    if name in ("payload", "link_offset"):
         return f"body/{machine.body}", None
-    if name in COMMANDS:
+    if name in COMMANDS and name != "joint_flexibility":
         return f"actuator/{machine.motors[joint]}", at
     return f"{at}/qpos" if name in READINGS else at, at
 
@@ -458,9 +273,8 @@ def _record(
     model: mujoco.MjModel,
     machine: Machine,
     case: dict[str, Any],
-    spot: Spot,
-    law: Law | None,
-    motor: Law | None,
+    motors: list[tuple[int, Law]],
+    forces: list[tuple[int, Law]],
     rng: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "rows nq"], Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nu"]]:
     """One recording: what the machine did, its velocities behind the sensors' filter, and what its motors were told."""
@@ -489,14 +303,22 @@ def _record(
         ctrl[i, 0] += machine.weight
         for _ in range(held):
             data.ctrl[:] = ctrl[i]
-            if motor is not None:
-                data.ctrl[spot.joint] = motor(float(ctrl[i, spot.joint]), float(data.qvel[spot.joint]), data.time)
-            if law is not None:
-                at = float(data.qpos[spot.joint]), float(data.qvel[spot.joint])
-                data.qfrc_applied[spot.joint] = law(*at, data.time)
+            for j, law in motors:
+                data.ctrl[j] = law(_moment(model, data, j))
+            data.qfrc_applied[:] = 0.0
+            for j, law in forces:
+                data.qfrc_applied[j] += law(_moment(model, data, j))
             mujoco.mj_step(model, data)
             filtered += share * (data.qvel - filtered)
     return q, v, ctrl
+
+
+def _moment(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> Moment:
+    """What there is to be known of a joint; motors are those of the first joints."""
+    other = 1 - joint if model.nv > 1 else joint
+    u = float(data.ctrl[joint]) if joint < model.nu else 0.0
+    now = float(data.qpos[joint]), float(data.qvel[joint]), data.time, model.opt.timestep
+    return Moment(u, *now, (float(data.qpos[other]), float(data.qvel[other])))
 
 
 def _write_recording(

@@ -7,8 +7,10 @@ import pytest
 
 from bayessim_jax.effects import EFFECTS
 from bayessim_jax.recordings.loading import load_case
-from benchmarks.strangers import COMMANDS, EDITS, FORCES, READINGS, UNKNOWN, draw_strangers, make_stranger
+from benchmarks.strangers import READINGS, UNKNOWN, draw_strangers, make_stranger
+from benchmarks.textbook import COMMANDS, EDITS, FORCES
 
+COUNTS = {"single": 1, "pair": 2, "unknown": 1, "clean": 0}
 SHORT = {
     "seconds": 1.0,
     "recordings": 1,
@@ -28,8 +30,8 @@ def of(case, **settings):
 def test_a_set_is_drawn_again_and_holds_every_group():
     drawn = draw_strangers(60, 3)
     assert drawn == draw_strangers(60, 3) and drawn != draw_strangers(60, 4)
-    assert {case["group"] for case in drawn} == {"single", "unknown", "clean"}
-    assert all(len(case["effects"]) == (case["group"] != "clean") for case in drawn)
+    assert {case["group"] for case in drawn} == set(COUNTS)
+    assert all(len(set(case["effects"])) == COUNTS[case["group"]] for case in drawn)
 
 
 @pytest.mark.parametrize("name", [*EDITS, *COMMANDS, *READINGS, *FORCES])
