@@ -65,12 +65,8 @@ def main() -> None:
     concealed.add_argument(
         "--rigs", nargs="+", choices=_RIGS, help="machines; those without contacts and with motors if left out"
     )
-    concealed.add_argument("--cases", type=int, default=200)
-    concealed.add_argument("--seed", type=int, default=1)
-    concealed.add_argument(
-        "--part", type=_part, default=(1, 1), metavar="K/N", help="every Nth case from the Kth on; one core each"
-    )
-    concealed.add_argument("--out", type=Path, help="file of JSON lines to append cases to, and to resume from")
+    _add_cases(concealed, 200, seed=1)
+    _add_part(concealed)
     concealed.add_argument(
         "--records", type=Path, nargs="+", help="files of cases: print what became of one, or a table of several"
     )
@@ -79,28 +75,23 @@ def main() -> None:
     strangers = commands.add_parser(
         "strangers", help="diagnoses of machines of another kind, simulated as anyone would"
     )
-    strangers.add_argument("--cases", type=int, default=60)
-    strangers.add_argument("--seed", type=int, default=1)
-    strangers.add_argument("--part", type=_part, default=(1, 1), metavar="K/N", help="every Nth case from the Kth on")
-    strangers.add_argument("--out", type=Path, help="file of JSON lines to append cases to, and to resume from")
+    _add_cases(strangers, 60, seed=1)
+    _add_part(strangers)
 
     identification = commands.add_parser("identification", help="posteriors of simulated machines against mujoco.sysid")
     identification.add_argument(
         "--rigs", nargs="+", choices=_RIGS, help="machines; five of one to three joints if left out"
     )
-    identification.add_argument("--cases", type=int, default=50)
-    identification.add_argument("--seed", type=int, default=0)
+    _add_cases(identification, 50, seed=0)
     identification.add_argument("--finer", type=int, default=4, help="times that the machines' time step is shorter")
     identification.add_argument("--method", choices=("direct", "amortised", "laplace"), default="direct")
-    identification.add_argument("--out", type=Path, help="file of JSON lines to append cases to, and to resume from")
     identification.add_argument("--beside", type=Path, help="such a file of another method, to compare with")
 
     thresholds = commands.add_parser("thresholds", help="diagnoses with the whole family of the effect left out")
     thresholds.add_argument(
         "--rigs", nargs="+", choices=_RIGS, help="machines; those of one and two joints if left out"
     )
-    thresholds.add_argument("--cases", type=int, default=60)
-    thresholds.add_argument("--out", type=Path, help="file of JSON lines to append cases to, and to resume from")
+    _add_cases(thresholds, 60)
     thresholds.add_argument(
         "--records", type=Path, nargs="+", help="of `concealed`: hold the answers in them against this"
     )
@@ -173,6 +164,18 @@ def _use_all_cores() -> None:
 def _add_common(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=0, help="PyTorch threads; 0 takes the faster of 1 and all cores")
+
+
+def _add_cases(parser: argparse.ArgumentParser, count: int, seed: int | None = None) -> None:
+    parser.add_argument("--cases", type=int, default=count)
+    if seed is not None:
+        parser.add_argument("--seed", type=int, default=seed)
+    parser.add_argument("--out", type=Path, help="file of JSON lines to append cases to, and to resume from")
+
+
+def _add_part(parser: argparse.ArgumentParser) -> None:
+    told = "every Nth case from the Kth on; one core each"
+    parser.add_argument("--part", type=_part, default=(1, 1), metavar="K/N", help=told)
 
 
 if __name__ == "__main__":

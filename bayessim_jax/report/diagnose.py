@@ -290,7 +290,6 @@ def _parameters(table: Mapping[str, Any]) -> str:
 
 def _settings(diagnosis: CaseDiagnosis, facts: Mapping[str, Any]) -> str:
     rows = [
-        ["engine", diagnosis.model.system.reason],
         ["candidates", str(len(diagnosis.bench.pairs))],
         ["windows that choose, that judge", f"{int(diagnosis.chosen.sum())}, {int((~diagnosis.chosen).sum())}"],
         ["held out", ", ".join(diagnosis.held_out)],

@@ -202,7 +202,6 @@ def _settings(result: CaseInference, facts: Mapping[str, Any]) -> str:
         [c, number(s, 4)] for c, s in zip(result.model.channels, np.asarray(result.posterior.fit.sigma), strict=True)
     ]
     rows = [
-        ["engine", result.model.system.reason],
         ["sampler", result.posterior.sampler],
         *_trust(result),
         ["windows fitted, held out", f"{len(result.fitted)}, {len(result.held_out)}"],
