@@ -212,6 +212,8 @@ class Diagnosis:
     """What is named leaves a rest in short pieces, which no candidate explains."""
     taken_back: Entry | None = None
     """An answer that was taken back, since it predicts recordings left out too badly."""
+    sooner: float | None = None
+    """p-value of no mismatch with every command a row earlier, where that leaves next to nothing of the misfit."""
 
     @property
     def names_something(self) -> bool:

@@ -53,6 +53,8 @@ RATIOS, SAME_STEP = np.linspace(0.0, 1.0, 5), 0.05
 """Time steps, of the model's own, that the best candidate is fitted with, and by how much one has to be another."""
 PIECE, LEAST = 0.16, 16
 """s and rows: naming is done with pieces of windows of about this length. Stick-slip makes longer ones chaotic."""
+MISTIMED = 0.1
+"""Share of the misfit that commands a row earlier leave at most where they are recorded too late."""
 LEAD = 0.2
 """s at the beginning of a recording that are left out where motors move a machine: what they were told before is not
 known, and late or slow ones remember it."""
@@ -445,10 +447,28 @@ def _explain(
         fitting = pool.submit(_fit_residual_force, key, taken, none)
         result = name_effects(key, taken.problem, none, thresholds=thresholds, say=say, go_on=go_on)
         if again is None:
+            result.sooner = _test_sooner(key, taken, none, thresholds)
             say("fitting a residual force without a name")
             return taken, result, fitting.result()
     say("the time step of what was recorded is another one, by what was found: once more with it")
     return _explain(key, again, thresholds, say)
+
+
+def _test_sooner(key: Array, taken: _Taken, none: Entry, thresholds: Thresholds) -> float | None:
+    """p-value of no mismatch where every command acts a row earlier than recorded, if that explains the recordings."""
+    model, windows = taken.model, take(taken.windows, taken.chosen)
+    if isinstance(model.system, Restarted) or not model.compiled.nu:
+        return None
+    ctrl = np.array(windows.ctrl)
+    for w, (k, start) in enumerate(zip(windows.recording, windows.start, strict=True)):
+        recording = model.recordings[k]
+        first = int(np.argmin(np.abs(recording.time - start))) + 1
+        ctrl[w] = recording.ctrl[np.minimum(first + np.arange(ctrl.shape[1]), len(recording.ctrl) - 1)]
+    problem = dataclasses.replace(taken.whole, shots=model.shots(dataclasses.replace(windows, ctrl=ctrl)))
+    _, found = detect(key, problem, none.fit.marginal(model.margins.size), taken.settled.error)
+    if is_mismatch(problem, found, thresholds) or share_left(found.misfit, none.misfit) > MISTIMED:
+        return None
+    return found.misfit.p_value
 
 
 def _absorbed(problem: Problem, none: Entry) -> list[str]:

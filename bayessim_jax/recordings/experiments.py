@@ -82,6 +82,8 @@ def _extremes(qpos: Float[np.ndarray, "rows nq"]) -> list[int]:
 
 def advise(result: Diagnosis, experiment: Experiment | None) -> str:
     """The same in a sentence; empty where nothing is to be told apart."""
+    if result.verdict == "unexplained" and result.sooner is not None:
+        return "look at when commands are recorded, and when they begin to act"
     if result.verdict != "ambiguous":
         return ""
     first, second = experiment.pair if experiment else (entry.names for entry in result.confusion[:2])

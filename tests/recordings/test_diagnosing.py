@@ -157,6 +157,20 @@ def test_what_no_candidate_explains_is_refused_and_located(folder):
 
 
 @pytest.mark.slow
+def test_commands_that_are_recorded_a_row_late_are_told(folder):
+    make_case(folder / "mistimed", "pendulum", seed=16)
+    for path in (folder / "mistimed" / "recordings").glob("*.csv"):
+        head, table = path.read_text().partition("\n")[0], np.loadtxt(path, delimiter=",", skiprows=1)
+        last = [i for i, name in enumerate(head.split(",")) if name.startswith("actuator")]
+        table[1:, last] = table[:-1, last]
+        np.savetxt(path, table[1:], fmt="%.9g", delimiter=",", header=head, comments="")
+    assert main(["diagnose", str(folder / "mistimed"), "--out", str(folder / "mistimed-run"), "--quiet"]) == 0
+    table = json.loads((folder / "mistimed-run" / "diagnosis.json").read_text())
+    assert table["verdict"] == "unexplained" and "when commands are recorded" in table["next_experiment"]
+    assert "recorded a row too late" in (folder / "mistimed-run" / "report.html").read_text()
+
+
+@pytest.mark.slow
 def test_two_effects_that_hide_each_other_are_both_named(folder):
     """Neither of them leads by itself: what gains most alone is another."""
     effects = ["actuator_lag", "quadratic_drag"]
