@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -49,12 +50,14 @@ from bayessim_jax.inference.replay import Restarted
 from bayessim_jax.inference.shooting import Fit, Shots
 from bayessim_jax.systems.mjcf import MjcfSystem
 
-__all__ = ["Problem", "detect", "is_mismatch", "name_effects"]
+__all__ = ["Problem", "detect", "is_hidden", "is_mismatch", "name_effects"]
 
 T, R = TypeVar("T"), TypeVar("R")
 
 SCREENED = 30
 """Windows with which every candidate is tried at first."""
+SHOWN = 0.1
+"""Power of the misfit over that of the noise that windows have to show, for what candidates leave to tell much."""
 FINALISTS, LEADERS, PAIRS = 7, 2, 4
 """Single effects that are simulated at most, at least, and pairs."""
 LOST = 0.8
@@ -203,6 +206,13 @@ def is_mismatch(problem: Problem, detected: Entry, thresholds: Thresholds | None
     thresholds = thresholds or Thresholds()
     size = detected.misfit.size(np.asarray(problem.shots.measured))
     return detected.misfit.p_value < FALSE_ALARMS and size > thresholds.negligible
+
+
+def is_hidden(key: PRNGKeyArray, problem: Problem, detected: Entry) -> bool:
+    """Whether noise hides in the problem's windows most of what the simulator lacks, which was detected in others."""
+    screen = problem.every
+    nothing = screen.begin(detected.fit.z[: screen.d], detected.fit.sigma)
+    return screen.misfit(key, nothing).size(np.asarray(screen.scene.shots.measured)) < SHOWN
 
 
 def name_effects(
@@ -694,7 +704,8 @@ def _replace(work: _Work, entries: list[Entry], pairs: Iterable[tuple[Entry, Ent
 
 def _are_rivals(entry: Entry, best: Entry, none: Entry, thresholds: Thresholds) -> bool:
     """Whether a candidate is a special case of the best one, or explains as much with one effect in another's place."""
-    replaced = len(set(best.names) - set(entry.names)) == len(set(entry.names) - set(best.names)) == 1
+    mine, its = Counter(entry.names), Counter(best.names)
+    replaced = (mine - its).total() == (its - mine).total() == 1
     return replaced and (share_left(entry.misfit, none.misfit) <= thresholds.left or has_special_case(best, entry))
 
 
@@ -849,7 +860,7 @@ def _finish(
             found = pool.map(lambda pair, p: enter(pair[0], p, pair[1].fit.sigma), simpler, begun)
             entries = sorted([*entries, *(e for e in found if e is not None)], key=lambda e: -e.score)
             rivals = [entry for entry in entries if _are_rivals(entry, best, none, thresholds)]
-            rivals += [entry for entry in entries if set(entry.names) < set(best.names)]
+            rivals += [entry for entry in entries if Counter(entry.names) < Counter(best.names)]
             rivals = [entry for entry in rivals if (best, entry) not in compared]
             compared |= {(best, entry) for entry in rivals}
             _replace(work, entries, zip(rivals, pool.map(partial(from_numbers_of, best), rivals), strict=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import permutations
@@ -342,7 +343,7 @@ def decide(
 
 def may_be_named(entry: Entry, entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:
     """Whether a candidate ties for the best of `entries`, which comes first, or is a part of one that does."""
-    return any(set(entry.names) <= set(other.names) for other in _tied(entries, none, thresholds))
+    return any(Counter(entry.names) <= Counter(other.names) for other in _tied(entries, none, thresholds))
 
 
 def contenders(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> list[Entry]:
@@ -548,7 +549,8 @@ def may_be_astray(entry: Entry, thresholds: Thresholds) -> bool:
 def _suffices(entry: Entry, tied: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:
     """Whether a candidate explains the misfit, and those that tie for the best add effects to it without much gain."""
     return explains(entry, none, thresholds) and all(
-        set(entry.names) < set(other.names) and not _leaves_less(other, entry, none, thresholds) for other in tied
+        Counter(entry.names) < Counter(other.names) and not _leaves_less(other, entry, none, thresholds)
+        for other in tied
     )
 
 
@@ -557,7 +559,7 @@ def is_worth(entry: Entry, entries: Sequence[Entry], none: Entry, thresholds: Th
 
     A little less is what any further effect leaves.
     """
-    parts = [other for other in entries if set(other.names) < set(entry.names)]
+    parts = [other for other in entries if Counter(other.names) < Counter(entry.names)]
     return all(_leaves_less(entry, part, none, thresholds) and entry.score >= part.score for part in parts)
 
 
@@ -628,7 +630,9 @@ def are_siblings(one: str, other: str) -> bool:
 
 def has_special_case(entry: Entry, other: Entry) -> bool:
     """Whether another candidate is this one with effects replaced by special cases of them, each at its place."""
-    return len(entry.names) == len(other.names) and set(entry.names) != set(other.names) and _is_left(other, entry)
+    return (
+        len(entry.names) == len(other.names) and Counter(entry.names) != Counter(other.names) and _is_left(other, entry)
+    )
 
 
 def _is_left(part: Entry, whole: Entry) -> bool:
@@ -639,8 +643,8 @@ def _is_left(part: Entry, whole: Entry) -> bool:
 
 def _apart(one: Entry, other: Entry) -> tuple[list[str], list[str]]:
     """What each of two sets has that the other has not, at joints."""
-    mine, its = set(one.names) - set(other.names), set(other.names) - set(one.names)
-    return [one.seats.get(name, name) for name in sorted(mine)], [other.seats.get(name, name) for name in sorted(its)]
+    mine, its = (sorted((Counter(a.names) - Counter(b.names)).elements()) for a, b in ((one, other), (other, one)))
+    return [one.seats.get(name, name) for name in mine], [other.seats.get(name, name) for name in its]
 
 
 def _weigh(result: Diagnosis, group: Int[np.ndarray, " windows"], temper: float, thresholds: Thresholds) -> list[float]:

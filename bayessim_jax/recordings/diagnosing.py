@@ -19,7 +19,7 @@ from bayessim_jax.diagnosis.bench import Bench, Candidate
 from bayessim_jax.diagnosis.experiment import Experiment
 from bayessim_jax.diagnosis.flexible import FEATURES, FLEXIBLE, UNITS, features
 from bayessim_jax.diagnosis.locate import Location, find_regime, find_windows_of, shares_from_left
-from bayessim_jax.diagnosis.procedure import Problem, detect, is_mismatch, name_effects
+from bayessim_jax.diagnosis.procedure import Problem, detect, is_hidden, is_mismatch, name_effects
 from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.diagnosis.screen import Screened
 from bayessim_jax.diagnosis.simulated_scene import SimulatedScene
@@ -52,7 +52,8 @@ LONG = 15
 RATIOS, SAME_STEP = np.linspace(0.0, 1.0, 5), 0.05
 """Time steps, of the model's own, that the best candidate is fitted with, and by how much one has to be another."""
 PIECE, LEAST = 0.16, 16
-"""s and rows: naming is done with pieces of windows of about this length. Stick-slip makes longer ones chaotic."""
+"""s and rows: naming is done with pieces of windows of about this length, and of longer ones where noise hides what is
+missing in them. Stick-slip makes long ones chaotic."""
 MISTIMED = 0.1
 """Share of the misfit that commands a row earlier leave at most where they are recorded too late."""
 LEAD = 0.2
@@ -208,6 +209,8 @@ class _Taken:
     model: CaseModel
     windows: Windows
     chosen: Bool[np.ndarray, " windows"]
+    fitting: Int[np.ndarray, " chosen"]
+    """Which of all the case's windows choose."""
     pieces: Windows
     whole: Problem
     """Windows as long as the horizon, by which a mismatch is detected."""
@@ -238,9 +241,22 @@ def _take_case(key: Array, model: CaseModel, effects: Sequence[Any], say: Callab
         step=model.step,
     )
     pieces, problem = (
-        (fitted, whole) if isinstance(system, Restarted) else _cut(model, whole, fitted, fitting, len(windows))
+        (fitted, whole)
+        if isinstance(system, Restarted)
+        else _cut(model, whole, fitted, fitting, len(windows), max(round(PIECE / system.dt), LEAST))
     )
-    return _Taken(model, windows, np.arange(len(windows)) < len(fitted), pieces, whole, problem, settled)
+    return _Taken(model, windows, np.arange(len(windows)) < len(fitted), fitting, pieces, whole, problem, settled)
+
+
+def _lengthen(key: Array, taken: _Taken, none: Entry) -> _Taken:
+    """The case in longer pieces, where noise hides in its own what whole windows show to be missing."""
+    fitted = take(taken.windows, taken.chosen)
+    if isinstance(taken.model.system, Restarted):
+        return taken
+    while (rows := taken.pieces.valid.shape[1]) < fitted.valid.shape[1] and is_hidden(key, taken.problem, none):
+        cut = _cut(taken.model, taken.whole, fitted, taken.fitting, len(taken.windows), 2 * rows)
+        taken = dataclasses.replace(taken, pieces=cut[0], problem=cut[1])
+    return taken
 
 
 def _settle_with(taken: _Taken, bench: Bench, best: Entry, thresholds: Thresholds) -> _Taken | None:
@@ -301,10 +317,9 @@ def _every_window(model: CaseModel) -> Windows:
 
 
 def _cut(
-    model: CaseModel, whole: Problem, fitted: Windows, fitting: Int[np.ndarray, " windows"], most: int
+    model: CaseModel, whole: Problem, fitted: Windows, fitting: Int[np.ndarray, " windows"], most: int, rows: int
 ) -> tuple[Windows, Problem]:
-    """Pieces of windows along their smoothed motion, and `most` to predict ahead, some of them repeated."""
-    rows = max(round(PIECE / model.system.dt), LEAST)
+    """Pieces of so many rows of windows along their smoothed motion, and `most` to predict ahead, some repeated."""
     pieces = cut_windows(fitted, rows)
     smooth = cut_windows(take(_every_window(model.smoothed), fitting), rows)
     problem = dataclasses.replace(
@@ -435,6 +450,7 @@ def _explain(
     say(f"no mismatch has p = {none.misfit.p_value:.3f}")
     if not is_mismatch(taken.whole, none, thresholds):
         return taken, Diagnosis("no_mismatch", plain, none, []), None
+    taken = _lengthen(key, taken, none)
     again: _Taken | None = None
 
     def go_on(bench: Bench, best: Entry) -> bool:

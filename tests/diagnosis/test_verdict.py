@@ -587,3 +587,12 @@ def test_a_special_case_that_was_tried_before_is_there_when_its_law_is_looked_at
     before = {each.candidate: each for each in (law, special)}
     assert _recall(laws, none, [law], before, Thresholds()) == [law, special]
     assert _recall(laws, none, [law], {law.candidate: law}, Thresholds()) == [law]
+
+
+def test_the_same_effect_twice_at_one_place_is_not_that_effect_once():
+    """Two stops of one joint bear one name, and are no special case of one of them beside a spring."""
+    spring, stops = ["joint_spring@joint/a", "soft_stop@joint/a"], ["soft_stop@joint/a", "soft_stop@joint/a"]
+    first, twice = entry(spring, 100.0, 0.0001), entry(stops, 99.9, 0.0002, spread=0.0)
+    stop, scale = entry(["soft_stop@joint/a"], 60.0, 0.5), entry(["soft_stop@joint/a", "b@y"], 99.95, 0.0001)
+    found = verdict(first, scale, twice, stop)
+    assert first in found.confusion and scale in found.confusion
