@@ -326,7 +326,8 @@ def decide(
     best = {tuple(entry.names): entry for entry in sorted(tied, key=lambda entry: entry.score)}
     fewest = min(map(len, best))
     least = [entry for names, entry in best.items() if len(names) == fewest]
-    least = [entry for entry in least if not any(_shows_more(other, entry, none, thresholds) for other in least)]
+    shown_less = [entry for entry in least if any(_shows_more(other, entry, none, thresholds) for other in least)]
+    least = [entry for entry in least if entry not in shown_less]
     sets = [entry for entry in least if not any(has_special_case(entry, other) for other in least)]
     temper = thresholds.least / _resolution(entries[0], none, thresholds)
 
@@ -334,9 +335,10 @@ def decide(
         better = max(temper * (entry.score - other.score), 0.0)
         return other.log_share - entry.log_share > thresholds.coincidence + better
 
-    sets = [entry for entry in sets if not any(is_coincidence(entry, other) for other in sets)]
+    coincidences = [entry for entry in sets if any(is_coincidence(entry, other) for other in sets)]
+    sets = [entry for entry in sets if entry not in coincidences]
     result.confusion = sorted(sets, key=lambda e: (len(bench.columns(e.candidate)), -e.score))
-    result.probabilities = _weigh(result, group, temper, thresholds)
+    result.probabilities = _weigh(result, [*shown_less, *coincidences], group, temper, thresholds)
     result.verdict = "explained" if len(sets) == 1 else "ambiguous"
     return result
 
@@ -647,26 +649,33 @@ def _apart(one: Entry, other: Entry) -> tuple[list[str], list[str]]:
     return [one.seats.get(name, name) for name in mine], [other.seats.get(name, name) for name in its]
 
 
-def _weigh(result: Diagnosis, group: Int[np.ndarray, " windows"], temper: float, thresholds: Thresholds) -> list[float]:
+def _weigh(
+    result: Diagnosis,
+    outdone: Sequence[Entry],
+    group: Int[np.ndarray, " windows"],
+    temper: float,
+    thresholds: Thresholds,
+) -> list[float]:
     """How probable every set of the confusion set is.
 
-    Weights of all candidates by their held-out scores, tempered to what these can resolve, under the Bayesian
-    bootstrap of the recordings, or of windows where these are few; what a set left out as needlessly complex has goes
-    to the sets that stand for it, and twins that leave the same have as much as each other. Of that, the share of the
-    misfit that a set explains, and the chance that nothing outside the library looks like it.
+    Weights of all candidates but the `outdone` by their held-out scores, tempered to what these can resolve, under the
+    Bayesian bootstrap of the recordings, or of windows where these are few; what a set left out as needlessly complex
+    has goes to the sets that stand for it, and twins that leave the same have as much as each other. Of that, the share
+    of the misfit that a set explains, and the chance that nothing outside the library looks like it.
 
     Source: Yao et al. 2018, section 3.4 (pseudo-BMA+)
     """
     units = group if len(set(group.tolist())) >= FEW else np.arange(len(group))
     labels = sorted(set(units.tolist()))
-    sums = np.array([[entry.scores[units == label].sum() for label in labels] for entry in result.entries])
+    rivals = [entry for entry in result.entries if entry not in outdone]
+    sums = np.array([[entry.scores[units == label].sum() for label in labels] for entry in rivals])
     draws = np.random.default_rng(0).dirichlet(np.ones(len(labels)), BOOTSTRAPS) * len(labels)
     z = temper * (draws @ sums.T)
     weights = np.exp(z - z.max(1, keepdims=True))
     weights = (weights / weights.sum(1, keepdims=True)).mean(0)
-    index = {id(entry): k for k, entry in enumerate(result.entries)}
+    index = {id(entry): k for k, entry in enumerate(rivals)}
     own = np.array([weights[index[id(entry)]] for entry in result.confusion])
-    for entry, weight in zip(result.entries, weights, strict=True):
+    for entry, weight in zip(rivals, weights, strict=True):
         if not any(entry is chosen for chosen in result.confusion):
             stands = np.array([_is_left(chosen, entry) for chosen in result.confusion], float)
             own = own + (weight * stands / stands.sum() if stands.any() else 0.0)

@@ -228,6 +228,7 @@ def test_what_does_as_well_by_a_coincidence_of_its_numbers_is_no_rival(share, be
     found = verdict(plain, contrived)
     assert found.verdict == wanted
     assert ["a@x"] in [each.names for each in found.confusion]
+    assert sum(found.probabilities) == pytest.approx(0.95, abs=0.01)
 
 
 @pytest.mark.parametrize(("p", "wanted"), [(0.001, "ambiguous"), (0.4, "explained")])
