@@ -124,10 +124,10 @@ ALIKE = (
 )
 """Effects of which two are not drawn together: they are one of them, or a third, with other numbers."""
 NOT_SEEN = {
-    "carriage": {"base_tilt", "payload", "link_offset", "sensor_offset"},
+    "carriage": {"base_tilt", "payload", "link_offset", "sensor_offset", "armature", "actuator_gain"},
     "lift": {"base_tilt", "payload", "link_offset", "sensor_offset", "actuator_saturation", "backlash"},
 }
-"""What moves nothing on a machine; a motor that cannot hold its weight is no lift's, whose weight closes every gap."""
+"""What is nothing on a machine, or another mass; a lift's motor can hold its weight, which closes every gap."""
 
 
 def diagnose_strangers(options: Namespace) -> None:
