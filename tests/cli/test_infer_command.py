@@ -41,6 +41,7 @@ def test_the_run_folder_holds_what_was_learned(run):
         assert {"prior", "posterior", "posterior_predictive", "observed_data"} <= set(tree.children)
 
 
+@pytest.mark.slow
 def test_networks_leave_the_same_files_and_say_how_they_were_judged(run):
     folder, _ = run
     words = ["infer", str(folder / "rig"), "--out", str(folder / "networks"), "--method", "amortised", "--quiet"]

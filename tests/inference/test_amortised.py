@@ -70,6 +70,7 @@ def test_a_linear_simulator_has_the_posterior_that_algebra_gives():
     np.testing.assert_allclose(found.draws, found.z, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_draws_and_another_does_not(monkeypatch):
     monkeypatch.setattr(networks, "ROUNDS", 1)
     monkeypatch.setattr(networks, "SCHEDULE", networks.SCHEDULE.replace(epochs=2))

@@ -65,6 +65,7 @@ def test_ppo_balances_a_known_pole():
     assert (returns("cartpole", [0.5, 0.3], policy, 20) >= 500).mean() >= 0.95
 
 
+@pytest.mark.slow
 def test_sac_swings_a_known_pendulum_up():
     policy = train("pendulum", *near([0.8, 0.6]), calls=8)
     assert returns("pendulum", [0.8, 0.6], policy, 20).mean() > -200

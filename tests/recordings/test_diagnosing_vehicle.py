@@ -40,6 +40,7 @@ def double():
     jax.config.update("jax_enable_x64", False)
 
 
+@pytest.mark.slow
 def test_late_wheels_on_one_side_are_named_among_few(tmp_path, double):
     case = write_case(tmp_path / "case", Vehicle(lag=(0.15, 0.0)), seed=1, recordings=5, rows=80)
     model = case_model(load_case(case).check(), before=1.0)

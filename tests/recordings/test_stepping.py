@@ -147,6 +147,7 @@ def coupled(tmp_path):
     return diagnose_case(jax.random.key(0), model, effects=[EFFECTS["joint_coupling"]]), sealed
 
 
+@pytest.mark.slow
 def test_the_answer_finds_the_step_that_its_simulator_without_it_could_not(coupled):
     found, sealed = coupled
     assert found.result.verdict == "explained"
