@@ -13,6 +13,7 @@ from bayessim_jax.recordings.diagnosing import _lowest, _take_case
 from bayessim_jax.recordings.loading import load_case
 from bayessim_jax.recordings.repaired import load_repaired
 from bayessim_jax.recordings.shots import case_model
+from benchmarks.strangers import make_stranger
 from benchmarks.worlds import make_case
 from tests.browser import CHROMIUM, open_in_chromium
 from tests.recordings.made_up_case import columns, write_case
@@ -168,6 +169,19 @@ def test_commands_that_are_recorded_a_row_late_are_told(folder):
     table = json.loads((folder / "mistimed-run" / "diagnosis.json").read_text())
     assert table["verdict"] == "unexplained" and "when commands are recorded" in table["next_experiment"]
     assert "recorded a row too late" in (folder / "mistimed-run" / "report.html").read_text()
+
+
+@pytest.mark.slow
+def test_what_noise_hides_in_short_pieces_is_named_in_long_ones(folder):
+    """In 0.16 s the friction of this carriage has a hundredth of the noise's power."""
+    machine = {"rig": "carriage", "effects": ["viscous_friction"], "size": 0.276, "damped": False, "seed": 200_032}
+    motion = {"motion": "chirp", "feedback": False, "rate": 500, "seconds": 4.0, "recordings": 5}
+    sensors = {"velocities": False, "filter": 0.0, "noise": 0.003, "jitter": 0.1}
+    make_stranger(folder / "noisy", machine | motion | sensors | {"integrator": "RK4", "timestep": 0.002})
+    assert main(["diagnose", str(folder / "noisy"), "--out", str(folder / "noisy-run"), "--quiet"]) == 0
+    table = json.loads((folder / "noisy-run" / "diagnosis.json").read_text())
+    assert table["confusion_set"] == [["viscous_friction@joint/rail"], ["back_emf@actuator/drive"]]
+    assert all(entry["misfit_left"] < 0.03 for entry in table["finalists"][:2])
 
 
 @pytest.mark.slow
