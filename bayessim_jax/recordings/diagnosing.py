@@ -51,6 +51,8 @@ LONG = 15
 """Steps of the solver for a force with many weights."""
 RATIOS, SAME_STEP = np.linspace(0.0, 1.0, 5), 0.05
 """Time steps, of the model's own, that the best candidate is fitted with, and by how much one has to be another."""
+TAKEN = 0.1
+"""Share of what that candidate leaves which another time step has to take."""
 PIECE, LEAST = 0.16, 16
 """s and rows: naming is done with pieces of windows of about this length, and of longer ones where noise hides what is
 missing in them. Stick-slip makes long ones chaotic."""
@@ -278,7 +280,10 @@ def _settle_with(taken: _Taken, bench: Bench, best: Entry, thresholds: Threshold
 
     costs = np.array([cost(ratio) for ratio in RATIOS])
     ratio = _lowest(RATIOS, costs)
-    if abs(ratio - error.ratio) < SAME_STEP or cost(error.ratio) - cost(ratio) < thresholds.least:
+    measured = np.asarray(taken.problem.shots.measured)
+    size = best.misfit.size(measured)
+    left = 0.5 * measured.sum() * size / (1.0 + size)  # nats that the candidate's misfit has in its own noise
+    if abs(ratio - error.ratio) < SAME_STEP or cost(error.ratio) - cost(ratio) < max(thresholds.least, TAKEN * left):
         return None
     model = dataclasses.replace(taken.model, step_error=dataclasses.replace(error, ratio=ratio))
     fitted, shots = take(taken.windows, taken.chosen), model.shots(taken.pieces)
