@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from bayessim_jax.concealment import UNKNOWN
 from benchmarks.concealed import ONE_LAW, diagnose_all
-from benchmarks.textbook import COMMANDS, EDITS, ELASTIC, FORCES, GRAVITY, TWO_JOINTS, Law, Moment, Spot
+from benchmarks.textbook import COMMANDS, EDITS, ELASTIC, FORCES, GRAVITY, Law, Moment, Spot
 
 if TYPE_CHECKING:
     from argparse import Namespace
@@ -123,9 +123,11 @@ ALIKE = (
     {"joint_flexibility", "backlash", "armature"},
 )
 """Effects of which two are not drawn together: they are one of them, or a third, with other numbers."""
+ONE_SLIDE = {"base_tilt", "payload", "link_offset", "sensor_offset", "joint_coupling"}
 NOT_SEEN = {
-    "carriage": {"base_tilt", "payload", "link_offset", "sensor_offset", "armature", "actuator_gain"},
-    "lift": {"base_tilt", "payload", "link_offset", "sensor_offset", "actuator_saturation", "backlash"},
+    "pendulum": {"joint_coupling"},
+    "carriage": {*ONE_SLIDE, "armature", "actuator_gain"},
+    "lift": {*ONE_SLIDE, "actuator_saturation", "backlash"},
 }
 """What is nothing on a machine, or another mass; a lift's motor can hold its weight, which closes every gap."""
 
@@ -146,8 +148,6 @@ def _draw(seed: int) -> dict[str, Any]:
     rig = str(rng.choice(list(MACHINES)))
     known = [*EDITS, *COMMANDS, *READINGS, *(name for name in FORCES if not name.startswith(UNKNOWN))]
     names = [name for name in known if name not in NOT_SEEN.get(rig, ())]
-    if rig not in ("crane", "arm"):
-        names = [name for name in names if name not in TWO_JOINTS]
     if group == "unknown":
         names = [name for name in FORCES if name.startswith(UNKNOWN)]
     effects = [str(rng.choice(names))] if group != "clean" else []

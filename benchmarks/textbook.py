@@ -13,7 +13,7 @@ import numpy as np
 
 from bayessim_jax.concealment import UNKNOWN
 
-__all__ = ["COMMANDS", "EDITS", "ELASTIC", "FORCES", "GRAVITY", "TWO_JOINTS", "Law", "Moment", "Spot"]
+__all__ = ["COMMANDS", "EDITS", "ELASTIC", "FORCES", "GRAVITY", "Law", "Moment", "Spot"]
 
 GRAVITY = 9.81
 
@@ -398,5 +398,3 @@ COMMANDS: dict[str, Builder] = {
     **ELASTIC,
 }
 """What arrives at a joint of its motor's command."""
-TWO_JOINTS = ("joint_coupling",)
-"""What takes another joint."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -704,8 +703,7 @@ def _replace(work: _Work, entries: list[Entry], pairs: Iterable[tuple[Entry, Ent
 
 def _are_rivals(entry: Entry, best: Entry, none: Entry, thresholds: Thresholds) -> bool:
     """Whether a candidate is a special case of the best one, or explains as much with one effect in another's place."""
-    mine, its = Counter(entry.names), Counter(best.names)
-    replaced = (mine - its).total() == (its - mine).total() == 1
+    replaced = (best.counts - entry.counts).total() == (entry.counts - best.counts).total() == 1
     return replaced and (share_left(entry.misfit, none.misfit) <= thresholds.left or has_special_case(best, entry))
 
 
@@ -860,7 +858,7 @@ def _finish(
             found = pool.map(lambda pair, p: enter(pair[0], p, pair[1].fit.sigma), simpler, begun)
             entries = sorted([*entries, *(e for e in found if e is not None)], key=lambda e: -e.score)
             rivals = [entry for entry in entries if _are_rivals(entry, best, none, thresholds)]
-            rivals += [entry for entry in entries if Counter(entry.names) < Counter(best.names)]
+            rivals += [entry for entry in entries if entry.counts < best.counts]
             rivals = [entry for entry in rivals if (best, entry) not in compared]
             compared |= {(best, entry) for entry in rivals}
             _replace(work, entries, zip(rivals, pool.map(partial(from_numbers_of, best), rivals), strict=True))

@@ -184,6 +184,11 @@ class Entry:
     """Names of effects, and the same at the joint that their actuator drives or whose zero they turn."""
 
     @property
+    def counts(self) -> Counter[str]:
+        """How often each name is among its effects: two stops of one joint bear one name."""
+        return Counter(self.names)
+
+    @property
     def title(self) -> str:
         """Its names in one line, for people."""
         return " + ".join(self.names) or "the time step alone"
@@ -345,7 +350,7 @@ def decide(
 
 def may_be_named(entry: Entry, entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:
     """Whether a candidate ties for the best of `entries`, which comes first, or is a part of one that does."""
-    return any(Counter(entry.names) <= Counter(other.names) for other in _tied(entries, none, thresholds))
+    return any(entry.counts <= other.counts for other in _tied(entries, none, thresholds))
 
 
 def contenders(entries: Sequence[Entry], none: Entry, thresholds: Thresholds) -> list[Entry]:
@@ -551,8 +556,7 @@ def may_be_astray(entry: Entry, thresholds: Thresholds) -> bool:
 def _suffices(entry: Entry, tied: Sequence[Entry], none: Entry, thresholds: Thresholds) -> bool:
     """Whether a candidate explains the misfit, and those that tie for the best add effects to it without much gain."""
     return explains(entry, none, thresholds) and all(
-        Counter(entry.names) < Counter(other.names) and not _leaves_less(other, entry, none, thresholds)
-        for other in tied
+        entry.counts < other.counts and not _leaves_less(other, entry, none, thresholds) for other in tied
     )
 
 
@@ -561,7 +565,7 @@ def is_worth(entry: Entry, entries: Sequence[Entry], none: Entry, thresholds: Th
 
     A little less is what any further effect leaves.
     """
-    parts = [other for other in entries if Counter(other.names) < Counter(entry.names)]
+    parts = [other for other in entries if other.counts < entry.counts]
     return all(_leaves_less(entry, part, none, thresholds) and entry.score >= part.score for part in parts)
 
 
@@ -632,9 +636,7 @@ def are_siblings(one: str, other: str) -> bool:
 
 def has_special_case(entry: Entry, other: Entry) -> bool:
     """Whether another candidate is this one with effects replaced by special cases of them, each at its place."""
-    return (
-        len(entry.names) == len(other.names) and Counter(entry.names) != Counter(other.names) and _is_left(other, entry)
-    )
+    return len(entry.names) == len(other.names) and entry.counts != other.counts and _is_left(other, entry)
 
 
 def _is_left(part: Entry, whole: Entry) -> bool:
@@ -645,7 +647,7 @@ def _is_left(part: Entry, whole: Entry) -> bool:
 
 def _apart(one: Entry, other: Entry) -> tuple[list[str], list[str]]:
     """What each of two sets has that the other has not, at joints."""
-    mine, its = (sorted((Counter(a.names) - Counter(b.names)).elements()) for a, b in ((one, other), (other, one)))
+    mine, its = (sorted((a.counts - b.counts).elements()) for a, b in ((one, other), (other, one)))
     return [one.seats.get(name, name) for name in mine], [other.seats.get(name, name) for name in its]
 
 
@@ -673,10 +675,9 @@ def _weigh(
     z = temper * (draws @ sums.T)
     weights = np.exp(z - z.max(1, keepdims=True))
     weights = (weights / weights.sum(1, keepdims=True)).mean(0)
-    index = {id(entry): k for k, entry in enumerate(rivals)}
-    own = np.array([weights[index[id(entry)]] for entry in result.confusion])
+    own = np.array([weights[rivals.index(entry)] for entry in result.confusion])
     for entry, weight in zip(rivals, weights, strict=True):
-        if not any(entry is chosen for chosen in result.confusion):
+        if entry not in result.confusion:
             stands = np.array([_is_left(chosen, entry) for chosen in result.confusion], float)
             own = own + (weight * stands / stands.sum() if stands.any() else 0.0)
     # what tells twins apart that leave the same is no misfit, and says nothing of which it is

@@ -219,6 +219,8 @@ class _Taken:
     problem: Problem
     """Pieces of them, by which it is named."""
     settled: Settled
+    detected: Entry | None = None
+    """The simulator as it is on whole windows, where it misses something."""
 
 
 def _take_case(key: Array, model: CaseModel, effects: Sequence[Any], say: Callable[[str], None]) -> _Taken:
@@ -252,9 +254,9 @@ def _take_case(key: Array, model: CaseModel, effects: Sequence[Any], say: Callab
 
 def _lengthen(key: Array, taken: _Taken, none: Entry) -> _Taken:
     """The case in longer pieces, where noise hides in its own what whole windows show to be missing."""
-    fitted = take(taken.windows, taken.chosen)
     if isinstance(taken.model.system, Restarted):
         return taken
+    fitted = take(taken.windows, taken.chosen)
     while (rows := taken.pieces.valid.shape[1]) < fitted.valid.shape[1] and is_hidden(key, taken.problem, none):
         cut = _cut(taken.model, taken.whole, fitted, taken.fitting, len(taken.windows), 2 * rows)
         taken = dataclasses.replace(taken, pieces=cut[0], problem=cut[1])
@@ -395,8 +397,8 @@ def diagnose_case(
     say("fitting the simulator as it is")
     taken = _take_case(fit_key, model, list(EFFECTS.values()) if effects is None else effects, say)
     say(f"{int(taken.chosen.sum())} windows choose, {int((~taken.chosen).sum())} judge")
-    taken, result, residual = _explain(key, taken, thresholds, say)
-    taken = _settle_answer(taken, result)
+    explained, result, residual = _explain(key, taken, thresholds, say)
+    taken = _settle_answer(explained, result)
     model, windows, chosen = taken.model, taken.windows, taken.chosen
     none, bench, shots = result.baseline, result.bench, model.shots(windows)
     scale = channel_scale(shots)
@@ -416,6 +418,8 @@ def diagnose_case(
         excused = _floor(variance + np.square(_beside(model, shots)), scale, shots)
         if is_refuted(judging, excused, scale, thresholds, result.beside_a_rest):
             result.take_back()
+    if result.verdict == "unexplained":
+        result.sooner = _test_sooner(key, explained, thresholds)
     named = result.verdict != "no_mismatch"
     return CaseDiagnosis(
         model=model,
@@ -455,7 +459,7 @@ def _explain(
     say(f"no mismatch has p = {none.misfit.p_value:.3f}")
     if not is_mismatch(taken.whole, none, thresholds):
         return taken, Diagnosis("no_mismatch", plain, none, []), None
-    taken = _lengthen(key, taken, none)
+    taken = dataclasses.replace(_lengthen(key, taken, none), detected=none)
     again: _Taken | None = None
 
     def go_on(bench: Bench, best: Entry) -> bool:
@@ -468,22 +472,22 @@ def _explain(
         fitting = pool.submit(_fit_residual_force, key, taken, none)
         result = name_effects(key, taken.problem, none, thresholds=thresholds, say=say, go_on=go_on)
         if again is None:
-            result.sooner = _test_sooner(key, taken, none, thresholds)
             say("fitting a residual force without a name")
             return taken, result, fitting.result()
     say("the time step of what was recorded is another one, by what was found: once more with it")
     return _explain(key, again, thresholds, say)
 
 
-def _test_sooner(key: Array, taken: _Taken, none: Entry, thresholds: Thresholds) -> float | None:
+def _test_sooner(key: Array, taken: _Taken, thresholds: Thresholds) -> float | None:
     """p-value of no mismatch where every command acts a row earlier than recorded, if that explains the recordings."""
-    model, windows = taken.model, take(taken.windows, taken.chosen)
-    if isinstance(model.system, Restarted) or not model.compiled.nu:
+    model, none = taken.model, taken.detected
+    if isinstance(model.system, Restarted) or not model.compiled.nu or none is None:
         return None
+    windows = take(taken.windows, taken.chosen)
     ctrl = np.array(windows.ctrl)
     for w, (k, start) in enumerate(zip(windows.recording, windows.start, strict=True)):
         recording = model.recordings[k]
-        first = int(np.argmin(np.abs(recording.time - start))) + 1
+        first = recording.row_at(start) + 1
         ctrl[w] = recording.ctrl[np.minimum(first + np.arange(ctrl.shape[1]), len(recording.ctrl) - 1)]
     problem = dataclasses.replace(taken.whole, shots=model.shots(dataclasses.replace(windows, ctrl=ctrl)))
     _, found = detect(key, problem, none.fit.marginal(model.margins.size), taken.settled.error)

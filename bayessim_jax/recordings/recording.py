@@ -60,6 +60,10 @@ class CaseRecording:
         edges = np.diff(np.concatenate([[False], self.valid, [False]]).astype(np.int8))
         return list(zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True))
 
+    def row_at(self, time: float) -> int:
+        """The row nearest to a time."""
+        return int(np.argmin(np.abs(self.time - time)))
+
 
 def resample(recording: CaseRecording, dt: float) -> CaseRecording:
     """The same recording on rows `dt` seconds apart, restarted after every break.

@@ -153,7 +153,7 @@ class CaseModel:
         unrecorded = np.zeros((len(windows), before), bool)
         for w in range(len(windows)):
             recording = self.recordings[windows.recording[w]]
-            row = int(np.argmin(np.abs(recording.time - windows.start[w])))
+            row = recording.row_at(windows.start[w])
             if before:
                 rows, smooth = np.arange(row - before, row), self.smoothed.recordings[windows.recording[w]]
                 unrecorded[w] = rows < 0

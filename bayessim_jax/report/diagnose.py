@@ -48,12 +48,12 @@ def headline(diagnosis: CaseDiagnosis) -> str:
             f"Nothing is missing: the simulator explains the recordings to within their noise (p = {number(p, 2)}); "
             f"{held} miss by {number(100 * before)} % of a channel's spread."
         )
-    if result.verdict == "unexplained" and result.sooner is not None:
-        return (
-            "Commands seem to be recorded a row too late: with each of them a row earlier the simulator explains the "
-            f"recordings to within their noise (p = {number(result.sooner, 2)}); as they are no candidate does."
-        )
     if result.verdict == "unexplained":
+        if result.sooner is not None:
+            return (
+                "Commands seem to be recorded a row too late: with each of them a row earlier the simulator explains "
+                f"the recordings to within their noise (p = {number(result.sooner, 2)}); as they are no candidate does."
+            )
         sentence = f"Something is missing at {where or 'no single joint'}, and none of the candidates explains it."
         if result.entries:
             best, floor = result.best, number(100 * diagnosis.noise_floor)

@@ -120,7 +120,7 @@ def test_without_sets_it_says_the_gaussian_that_it_reads():
     assert jnp.allclose(said.covariance(), tril @ tril.T, atol=1e-5)
 
 
-@pytest.mark.parametrize("n", [1, 8])
+@pytest.mark.parametrize("n", [1, pytest.param(2, marks=pytest.mark.slow), 8])
 def test_a_handful_of_sets_gives_finite_numbers(n):
     means = jax.random.normal(jax.random.key(5), (n, 3))
     found, levels = read_sets(
