@@ -19,9 +19,15 @@ QUICKLY_COMPILED = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emit
 
 
 def pytest_configure(config):
-    """Quick tests run a program once or twice: what they cost is its compilation, here and in processes they start."""
+    """Quick tests run a program once or twice: what they cost is its compilation, here and in processes they start.
+
+    The loop's own level of optimization gives way to that of the flags.
+    """
     if config.option.markexpr == "not slow":
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICKLY_COMPILED}".strip()
+        from bayessim_jax import online
+
+        online.COMPILER_OPTIONS = {}
 
 
 def pytest_collection_modifyitems(items):

@@ -83,7 +83,7 @@ def test_the_mean_cost_of_linear_gaussian_dynamics_is_exact(d):
     system, belief = linear_system(d), mixture(d)
     disco = Disco.create(system, Quadratic(), "unscented", components=2, horizon=6, samples=7)
     start = jnp.array([0.5, -1.0])
-    _, _, info = disco.act(jax.random.key(1), disco.init(), start, belief)
+    _, _, info = jax.jit(disco.act)(jax.random.key(1), disco.init(), start, belief)
     total = np.zeros(7)
     mean, gain = jnp.broadcast_to(start[:, None], (2, 7)), jnp.zeros((2, d))
     for u in info.actions:
@@ -98,13 +98,14 @@ def test_components_of_a_cut_belief_are_those_of_its_draws():
     cut = Truncated.create(
         GaussianMixture(jnp.zeros(1), jnp.array([[0.9, 0.2]]), jnp.array([[[0.3, 0.0], [0.1, 0.5]]])), box
     )
-    draws = jax.vmap(cut.sample)(jax.random.split(jax.random.key(0), 20_000))
-    found = components(cut)
+    draws = jax.jit(jax.vmap(cut.sample))(jax.random.split(jax.random.key(0), 20_000))
+    found = jax.jit(components)(cut)
     np.testing.assert_allclose(found.mean(), draws.mean(0), atol=0.01)
     np.testing.assert_allclose(found.covariance(), np.cov(np.asarray(draws).T), atol=0.01)
     for flat in (Truncated.uniform(box, 3), Uniform(box)):
-        np.testing.assert_allclose(components(flat).mean(), [0.5, 1.0], atol=1e-4)
-        np.testing.assert_allclose(components(flat).covariance(), np.diag([1 / 12, 4 / 12]), atol=1e-3)
+        found = jax.jit(components)(flat)
+        np.testing.assert_allclose(found.mean(), [0.5, 1.0], atol=1e-4)
+        np.testing.assert_allclose(found.covariance(), np.diag([1 / 12, 4 / 12]), atol=1e-3)
 
 
 def test_risks_are_what_their_names_say():
@@ -135,7 +136,7 @@ def extreme(p, tail):
 def test_costs_that_are_not_negative_stay_so(use, risk):
     disco = Disco.create(Pendulum.create(), Upswing(), use, risk=risk, samples=50)
     belief = Truncated.uniform(disco.system.parameters, 5)
-    _, _, info = disco.act(jax.random.key(0), disco.init(), jnp.array([-1.0, 0.0, 0.5]), belief)
+    _, _, info = jax.jit(disco.act)(jax.random.key(0), disco.init(), jnp.array([-1.0, 0.0, 0.5]), belief)
     assert info.costs.min() >= 0
     assert info.costs.max() < 1e30
 

@@ -152,7 +152,7 @@ def test_neutral_in_contact(name, in_float64):
     actions = jnp.asarray(chirp(30, base.dt, 0.4, 2))
     theta = jnp.array([p.neutral for p in augmented.effects[0].parameters], float)
     state = augmented.begin(theta, base.qpos, base.qvel, actions[0])
-    new = augmented.positions(augmented.replay(theta, state, actions))
+    new = augmented.positions(jax.jit(augmented.replay)(theta, state, actions))
     bare = jnp.zeros(0)
     old = base.positions(base.replay(bare, base.begin(bare, base.qpos, base.qvel), actions))
     np.testing.assert_allclose(new, old, rtol=0, atol=0 if EFFECTS[name].port == "model" else 1e-9)
@@ -273,7 +273,7 @@ def test_step_and_replay_are_the_same():
     augmented = with_effects(base, [(EFFECTS[n], p) for n, p in pairs], Scales())
     theta, actions = start_of(augmented), jnp.asarray(chirp(30, actuators=2), float)
     state = augmented.begin(theta, jnp.full(2, 0.3), jnp.zeros(2), actions[0])
-    states = augmented.replay(theta, state, actions)
+    states = jax.jit(augmented.replay)(theta, state, actions)
     step = jax.jit(augmented.step)
     for action in actions:
         state = step(theta, state, action)
@@ -287,12 +287,12 @@ def test_windows_restarted_with_past_commands_go_on_as_the_whole():
     augmented = with_effects(base, [(EFFECTS[n], p) for n, p in pairs], Scales(duration=1.0))
     theta, actions = start_of(augmented), jnp.asarray(chirp(80, force=0.5), float)
     state = augmented.begin(theta, jnp.array([0.3]), jnp.zeros(1), actions[0])
-    states = augmented.replay(theta, state, actions)
+    states = jax.jit(augmented.replay)(theta, state, actions)
     middle = jax.tree.map(lambda x: x[39], states)
     restarted = augmented.begin(
         theta, augmented.positions(middle), augmented.velocities(middle), actions[40], time=0.4, past=actions[:40]
     )
-    later = augmented.replay(theta, restarted, actions[40:])
+    later = jax.jit(augmented.replay)(theta, restarted, actions[40:])
     np.testing.assert_allclose(later.base.physics.qpos[0], states.base.physics.qpos[0][40:], atol=1e-5)
 
 
@@ -304,7 +304,7 @@ def test_a_long_past_is_gone_through_in_few_steps():
     theta = jnp.array([0.5, 0.05, 0.4])
     actions = jnp.asarray(0.4 * np.sign(np.sin(2.1 * 0.01 * np.arange(700)))[:, None], float)
     state = augmented.begin(theta, jnp.array([0.3]), jnp.zeros(1), actions[0])
-    states = augmented.replay(theta, state, actions)
+    states = jax.jit(augmented.replay)(theta, state, actions)
     middle = jax.tree.map(lambda x: x[599], states)
     where = (augmented.positions(middle), augmented.velocities(middle), actions[600])
     wanted = float(middle.memories[1])
@@ -315,7 +315,7 @@ def test_a_long_past_is_gone_through_in_few_steps():
 
 def every_state(augmented, theta, begun, actions):
     """The one that a replay begins in, and those after each control period."""
-    after = augmented.replay(theta, begun, actions)
+    after = jax.jit(augmented.replay)(theta, begun, actions)
     return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), begun, after)
 
 
@@ -405,10 +405,10 @@ def test_any_system_takes_effects_of_its_actuators_and_sensors(name):
     theta = jnp.array([0.7, 0.5, *(p.neutral for p in augmented.effects[0].parameters)])
     actions = jnp.asarray(chirp(40, 0.05, 1.5), float)
     states = jax.jit(augmented.replay)(theta, augmented.reset(jax.random.key(0), theta), actions)
-    seen = jax.vmap(lambda s: augmented.observe(theta, s))(states)
-    state = base.reset(jax.random.key(0), theta[:2])
+    seen = jax.jit(jax.vmap(augmented.observe, (None, 0)))(theta, states)
+    state, step = base.reset(jax.random.key(0), theta[:2]), jax.jit(base.step)
     for action, row in zip(actions, seen, strict=True):
-        state = jax.jit(base.step)(theta[:2], state, action)
+        state = step(theta[:2], state, action)
         np.testing.assert_allclose(base.observe(theta[:2], state), row, atol=2e-4)
 
 

@@ -1,3 +1,5 @@
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import pytest
@@ -9,6 +11,11 @@ from bayessim_jax.inference.recalibration import credible_levels, judge, nearnes
 FREE = -jnp.inf, jnp.inf
 
 
+regression, recalibration = jax.jit(regress), jax.jit(recalibrate)
+apply = jax.jit(lambda found, mixtures: jax.vmap(found.apply)(mixtures))
+
+
+@partial(jax.jit, static_argnames="draws")
 def credible_level(key, mixtures, truths, low, high, draws=64):
     return credible_levels(key, mixtures, truths, low, high, jnp.ones(1), draws)[:, 0]
 
@@ -22,10 +29,10 @@ def test_recalibration_undoes_a_known_bias_and_overconfidence():
     stated = GaussianMixture(
         jnp.zeros((n, 1)), (means + tril @ jnp.array([0.4, -0.2]))[:, None], jnp.broadcast_to(tril / 2, (n, 1, d, d))
     )
-    found = regress(stated, truths, jnp.ones(n))
+    found = regression(stated, truths, jnp.ones(n))
     assert jnp.allclose(found.shift(jnp.zeros(d)), -2 * jnp.array([0.4, -0.2]), atol=0.1)
     assert jnp.allclose(jnp.diagonal(found.stretch), 2.0, atol=0.15)
-    corrected = jax.vmap(found.apply)(stated)
+    corrected = apply(found, stated)
     level = credible_level(jax.random.key(2), corrected, truths, *FREE)
     assert abs(float((level <= 0.9).mean()) - 0.9) < 0.02 and abs(float((level <= 0.5).mean()) - 0.5) < 0.03
 
@@ -35,7 +42,7 @@ def test_recalibration_leaves_a_calibrated_posterior_alone():
     means = jax.random.normal(jax.random.key(3), (n, 3))
     truths = means + jax.random.normal(jax.random.key(4), (n, 3))
     stated = GaussianMixture(jnp.zeros((n, 1)), means[:, None], jnp.broadcast_to(jnp.eye(3), (n, 1, 3, 3)))
-    found = regress(stated, truths, jnp.ones(n))
+    found = regression(stated, truths, jnp.ones(n))
     assert jnp.abs(jax.vmap(found.shift)(means)).max() < 0.3 and jnp.allclose(found.stretch, jnp.eye(3), atol=0.1)
 
 
@@ -46,7 +53,7 @@ def test_recalibration_takes_out_an_error_that_depends_on_where_the_posterior_si
     # a network that shrinks towards zero and knows nothing of it
     means = 0.5 * truths + 0.05 * jax.random.normal(keys[1], (n, 2))
     stated = GaussianMixture(jnp.zeros((n, 1)), means[:, None], jnp.broadcast_to(0.05 * jnp.eye(2), (n, 1, 2, 2)))
-    corrected = jax.vmap(regress(stated, truths, jnp.ones(n)).apply)(stated)
+    corrected = apply(regression(stated, truths, jnp.ones(n)), stated)
     assert jnp.abs(corrected.means[:, 0] - truths).mean() < 0.1
     assert jnp.allclose(jnp.sqrt(jax.tree.map(lambda leaf: leaf[0], corrected).covariance().diagonal()), 0.1, atol=0.01)
     assert abs(float((credible_level(jax.random.key(6), corrected, truths, *FREE) <= 0.9).mean()) - 0.9) < 0.03
@@ -57,8 +64,8 @@ def test_a_pair_of_weight_zero_does_not_count():
     truths = means + jax.random.normal(jax.random.key(8), (40, 2))
     stated = GaussianMixture(jnp.zeros((40, 1)), means[:, None], jnp.broadcast_to(jnp.eye(2), (40, 1, 2, 2)))
     first = jax.tree.map(lambda leaf: leaf[:25], stated)
-    some = regress(stated, truths.at[25:].set(9.0), (jnp.arange(40) < 25).astype(float))
-    fewer = regress(first, truths[:25], jnp.ones(25))
+    some = regression(stated, truths.at[25:].set(9.0), (jnp.arange(40) < 25).astype(float))
+    fewer = regression(first, truths[:25], jnp.ones(25))
     assert all(
         jnp.allclose(a, b, atol=1e-4) for a, b in zip(jax.tree.leaves(some), jax.tree.leaves(fewer), strict=True)
     )
@@ -74,9 +81,9 @@ def test_a_posterior_that_leaks_out_of_the_box_is_recalibrated_to_the_sets_it_st
     box = -jnp.ones(1), jnp.ones(1)
     before = credible_level(keys[2], stated, truths, *box)
     assert (before <= 0.9).mean() < 0.82
-    found, level = recalibrate(keys[2], stated, truths, jnp.ones(n), *box)
+    found, level = recalibration(keys[2], stated, truths, jnp.ones(n), *box)
     assert _near(level, 0.5, 0.04) and _near(level, 0.9, 0.03)
-    again = credible_level(jax.random.key(10), jax.vmap(found.apply)(stated), truths, *box, draws=512)
+    again = credible_level(jax.random.key(10), apply(found, stated), truths, *box, draws=512)
     assert _near(again, 0.5, 0.04) and _near(again, 0.9, 0.03)
 
 
@@ -96,8 +103,8 @@ def test_recalibration_is_as_ready_to_narrow_as_to_widen(factor):
         trils = jnp.broadcast_to(0.3 * factor * jnp.eye(2), (2 * n, 1, 2, 2))
         stated = GaussianMixture(jnp.zeros((2 * n, 1)), means[:, None], trils)
         seen, fresh = (jax.tree.map(lambda leaf, part=part: leaf[part], stated) for part in (slice(n), slice(n, None)))
-        found, _ = recalibrate(keys[2], seen, truths[:n], jnp.ones(n), -jnp.full(2, 9.0), jnp.full(2, 9.0))
-        return credible_level(keys[3], jax.vmap(found.apply)(fresh), truths[n:], *FREE)
+        found, _ = recalibration(keys[2], seen, truths[:n], jnp.ones(n), -jnp.full(2, 9.0), jnp.full(2, 9.0))
+        return credible_level(keys[3], apply(found, fresh), truths[n:], *FREE)
 
     levels = jax.lax.map(one, jax.random.split(jax.random.key(11), 24)).ravel()
     assert _near(levels, 0.5, 0.02) and _near(levels, 0.9, 0.015)
@@ -114,8 +121,8 @@ def test_recalibration_looks_at_the_simulations_near_what_was_observed():
     middle = GaussianMixture(jnp.zeros(1), jnp.zeros((1, 2)), 0.2 * jnp.eye(2)[None])
     weights = nearness(stated, middle, share=0.3)
     assert jnp.allclose(weights.sum(), weights.sum() ** 2 / (weights**2).sum(), rtol=1e-4)
-    near, _ = recalibrate(keys[2], stated, truths, weights, *FREE)
-    far, _ = recalibrate(keys[2], stated, truths, jnp.ones(n), *FREE)
+    near, _ = recalibration(keys[2], stated, truths, weights, *FREE)
+    far, _ = recalibration(keys[2], stated, truths, jnp.ones(n), *FREE)
     assert jnp.allclose(jnp.diagonal(near.stretch), 1.0, atol=0.15)
     assert (jnp.diagonal(far.stretch) > 1.5).all()
 

@@ -46,6 +46,7 @@ def draw(key, low, high, n):
 
 
 judge = jax.jit(jax.vmap(strangeness, (None, 0, None)))
+judge_one = jax.jit(strangeness)
 ALL = jnp.ones(SET, bool)
 
 
@@ -74,9 +75,9 @@ def test_only_what_counts_is_judged():
     simulated = sets(carriage(), jax.random.key(0), draw(jax.random.key(1), 0.2, 2.0, 64))
     seen = jax.tree.map(lambda leaf: leaf[0], sets(carriage(), jax.random.key(2), jnp.full((1, 1), 1.0)))
     broken = seen.replace(observations=seen.observations.at[0].set(1e3))
-    assert strangeness(simulated, broken, ALL) > STRANGE
-    without = strangeness(simulated, broken, ALL.at[0].set(False))
-    np.testing.assert_allclose(without, strangeness(simulated, seen, ALL.at[0].set(False)), rtol=1e-4)
-    assert jnp.isnan(strangeness(simulated, seen, ~ALL))
+    assert judge_one(simulated, broken, ALL) > STRANGE
+    without = judge_one(simulated, broken, ALL.at[0].set(False))
+    np.testing.assert_allclose(without, judge_one(simulated, seen, ALL.at[0].set(False)), rtol=1e-4)
+    assert jnp.isnan(judge_one(simulated, seen, ~ALL))
     few = jax.tree.map(lambda leaf: leaf[: FEWEST - 1], simulated)
     assert jnp.isnan(strangeness(few, seen, ALL))
