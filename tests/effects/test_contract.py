@@ -185,7 +185,7 @@ def test_derivatives_are_those_of_finite_differences(name):
 
 
 @pytest.mark.parametrize("name", ON_ARM)
-@pytest.mark.parametrize("timestep", [0.002, 0.005])
+@pytest.mark.parametrize("timestep", [pytest.param(0.002, marks=pytest.mark.slow), 0.005])
 def test_corners_of_the_ranges_are_stable_in_float32(name, timestep):
     base = system(arm(timestep), "lower")
     augmented = attach(name, base)
