@@ -55,23 +55,18 @@ def cartpole():
     return setup, SimulatedTarget(system, task, jnp.array([0.4, 0.6]))
 
 
-def _broken_system(limit):
-    """x' = θ x, and NaN as soon as θ is above a limit."""
-    return from_functions(
+@pytest.fixture(scope="module")
+def small():
+    """x' = 0.9 x + 0.1 θ u, and NaN where θ is above 0.7; nothing is learned but the posterior: soon compiled."""
+    system = from_functions(
         parameters=Box.create(rate=(0.1, 1.0, "1/s")),
         observations=Box.create(x=(-1.0, 1.0, "m")),
         actions=Box.create(u=(-1.0, 1.0, "N")),
         noise=0.01,
         dt=0.1,
         reset=lambda key, theta: jax.random.uniform(key, (1,)),
-        step=lambda theta, x, u: jnp.where(theta[0] > limit, jnp.nan, 0.9 * x + 0.1 * theta * u),
+        step=lambda theta, x, u: jnp.where(theta[0] > 0.7, jnp.nan, 0.9 * x + 0.1 * theta * u),
     )
-
-
-@pytest.fixture(scope="module")
-def small():
-    """One parameter, one state, nothing learned but the posterior: a round that is soon compiled."""
-    system = _broken_system(0.7)
     sizes = {"steps": 12, "simulations": 64, "pool": 2, "components": 2, "history": 4, "calibrations": 16, "kept": 5}
     setup = online.Setup.create(system, Fixed(RandomPolicy(system.actions)), estimator=TINY, **sizes)
     return setup, SimulatedTarget(system, None, jnp.array([0.3]))

@@ -154,7 +154,7 @@ def test_neutral_in_contact(name, in_float64):
     state = augmented.begin(theta, base.qpos, base.qvel, actions[0])
     new = augmented.positions(jax.jit(augmented.replay)(theta, state, actions))
     bare = jnp.zeros(0)
-    old = base.positions(base.replay(bare, base.begin(bare, base.qpos, base.qvel), actions))
+    old = base.positions(jax.jit(base.replay)(bare, base.begin(bare, base.qpos, base.qvel), actions))
     np.testing.assert_allclose(new, old, rtol=0, atol=0 if EFFECTS[name].port == "model" else 1e-9)
 
 

@@ -46,8 +46,8 @@ def test_registered_systems_keep_the_contract(name):
 def test_rollouts_stay_finite_over_the_whole_prior(name):
     system, task = SYSTEMS[name].system(), SYSTEMS[name].task()
     box = system.parameters
-    theta = box.low + box.width * jax.random.uniform(jax.random.key(0), (64, box.size))
-    keys = jax.random.split(jax.random.key(1), 64)
+    theta = box.low + box.width * jax.random.uniform(jax.random.key(0), (200, box.size))
+    keys = jax.random.split(jax.random.key(1), 200)
     recordings = jax.jit(jax.vmap(lambda k, t: rollout(k, system, t, still(system), 100, task)))(keys, theta)
     assert not recordings.diverged.any()
     assert jnp.isfinite(recordings.observations).all()
