@@ -24,7 +24,7 @@ from bayessim_jax.effects import EffectParameter, Scales, at, with_effects
 from bayessim_jax.effects.attach import wire
 from bayessim_jax.effects.places import turned_joint
 from bayessim_jax.inference.replay import Inputs, Restarted, replay_window
-from bayessim_jax.inference.shooting import COMPILER_OPTIONS, DAMPING, Fit, Shots, predict_all, solve
+from bayessim_jax.inference.shooting import DAMPING, FEW_CALLS, Fit, Shots, predict_all, solve
 from bayessim_jax.programs import trace_once
 from bayessim_jax.systems.mjcf import MjcfSystem, system_key
 
@@ -358,4 +358,4 @@ def traded(
     return points
 
 
-_replay = trace_once(predict_all, static_argnames="predict", compiler_options=COMPILER_OPTIONS)
+_replay = trace_once(predict_all, static_argnames="predict", compiler_options=FEW_CALLS)

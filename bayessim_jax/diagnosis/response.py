@@ -23,7 +23,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from bayessim_jax.contracts import Scalar
-from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Curvature, eliminate, stride
+from bayessim_jax.inference.shooting import COMPILER_OPTIONS, FEW_CALLS, Curvature, eliminate, stride
 from bayessim_jax.programs import trace_once
 from bayessim_jax.systems.mjcf import displace
 
@@ -272,7 +272,7 @@ def _divide(b: Float[Array, "windows steps n nv"], by: Float[Array, "windows ste
     return jnp.stack([found[k] / rows[k][k][..., None] for k in range(nv)], -1)
 
 
-@trace_once(compiler_options=COMPILER_OPTIONS)
+@trace_once(compiler_options=FEW_CALLS)
 def find_heavier(
     lin: Linearized, gaps: Float[Array, "d k windows steps n"], width: Float[Numbers, " nv"], by: Float[Numbers, " d"]
 ) -> Float[Array, "windows steps d nv nv"]:
@@ -306,7 +306,7 @@ def _see(
     return jnp.moveaxis(apply(c, e), -1, 0)
 
 
-@trace_once(static_argnames="d", compiler_options=COMPILER_OPTIONS)
+@trace_once(static_argnames="d", compiler_options=FEW_CALLS)
 def respond(lin: Linearized, windowed: Windowed, d: int) -> Float[Array, "windows dn rowsobs"]:
     """How readings move with θ's z and with the initial state: what no candidate changes to first order."""
     count, steps, n = lin.gap.shape
@@ -410,7 +410,7 @@ def expand_response(
     return r.reshape(windowed.y.shape), jnp.concatenate([rest.slopes[:, :d], own, rest.slopes[:, d:]], 1)
 
 
-@trace_once(static_argnames="pieces", compiler_options=COMPILER_OPTIONS, to_numpy=True)
+@trace_once(static_argnames="pieces", compiler_options=FEW_CALLS, to_numpy=True)
 def bound_gains(
     lin: Linearized,
     rest: Rest,
@@ -486,7 +486,7 @@ def propose(
     return to, delta + states * spread, cost
 
 
-@trace_once(compiler_options=COMPILER_OPTIONS, to_numpy=True)
+@trace_once(compiler_options=FEW_CALLS, to_numpy=True)
 def cross_validate(
     r: Float[Array, "windows rows obs"],
     slopes: Float[Array, "windows kn rowsobs"],

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Predict, Ridge, Shots
+from bayessim_jax.inference.shooting import FEW_CALLS, Predict, Ridge, Shots
 from bayessim_jax.programs import trace_once
 
 __all__ = [
@@ -84,7 +84,7 @@ def _of_each_window(shots: Shots) -> Any:
     return jax.tree.map(own, shots.axes, shots.inputs, is_leaf=lambda axis: axis is None)
 
 
-@trace_once(static_argnames="predict", compiler_options=COMPILER_OPTIONS)
+@trace_once(static_argnames="predict", compiler_options=FEW_CALLS)
 def _predict(predict: Predict, inputs: Any, z: Array, delta: Array) -> Float[Array, "windows rows obs"]:
     return jax.vmap(predict, in_axes=(None, 0, 0))(z, delta, inputs)
 

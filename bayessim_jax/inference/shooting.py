@@ -33,6 +33,7 @@ from bayessim_jax.programs import trace_once
 
 __all__ = [
     "COMPILER_OPTIONS",
+    "FEW_CALLS",
     "absorb",
     "Curvature",
     "Fit",
@@ -224,9 +225,17 @@ def eliminate(c: Curvature, damping: Scalar | float = 0.0) -> tuple[Array, Array
     return precision, gradient, toward, shift
 
 
-COMPILER_OPTIONS = {"xla_cpu_use_fusion_emitters": False, "xla_disable_hlo_passes": TASKS, **WIDE}
-"""For programs of small arrays on a CPU: compilation takes half as long, vectors are wide, and no operation of a time
-step is cut up for a pool of threads."""
+COMPILER_OPTIONS = {
+    "xla_backend_optimization_level": 1,
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_disable_hlo_passes": TASKS,
+    **WIDE,
+}
+"""For programs of small arrays on a CPU: compilation takes less than half as long, vectors are wide, and no operation
+of a time step is cut up for a pool of threads."""
+FEW_CALLS = COMPILER_OPTIONS | {"xla_backend_optimization_level": 0}
+"""For programs of which a person waits for the compiler and not for the few times that they run: compiled in a third of
+the time, and some three times slower."""
 
 
 @struct.dataclass
@@ -350,7 +359,7 @@ def _arrive(march: _March, sigma: Array, terms: _Terms, shape: tuple[int, ...]) 
 
 _look = trace_once(expand, static_argnames=("predict", "step", "live"), compiler_options=COMPILER_OPTIONS)
 _go_on = trace_once(_advance, compiler_options=COMPILER_OPTIONS)
-_end = trace_once(_arrive, static_argnames="shape", compiler_options=COMPILER_OPTIONS)
+_end = trace_once(_arrive, static_argnames="shape", compiler_options=FEW_CALLS, to_numpy=True)
 
 
 def solve(
@@ -397,7 +406,7 @@ def solve(
     return _end(march, noise, terms, shots.y.shape)
 
 
-@trace_once(to_numpy=True)
+@trace_once(compiler_options=FEW_CALLS, to_numpy=True)
 def robust_covariance(fit: Fit) -> Float[np.ndarray, "d d"]:
     """Covariance of z where the model is only nearly right: Laplace's, wider where windows disagree more than noise.
 

@@ -38,14 +38,15 @@ def write_state(folder: RunFolder, diagnosis: CaseDiagnosis) -> None:
     for name in diagnosis.scores:
         if name == "flexible":
             assert diagnosis.flexible is not None and diagnosis.flexible_bench is not None
-            own, candidate, x = diagnosis.flexible_bench, diagnosis.flexible.candidate, diagnosis.flexible.p
+            own, candidate, last = diagnosis.flexible_bench, diagnosis.flexible.candidate, diagnosis.flexible.p
         else:
             entry = diagnosis.result.baseline if name == "baseline" else diagnosis.result.best
-            own, candidate, x = bench, entry.candidate, entry.fit.z
+            own, candidate, last = bench, entry.candidate, entry.fit.z
+        x: Any = np.asarray(last)
         entries[name] = {
             "effects": [[effect.name, place] for effect, place in (own.pairs[k] for k in candidate.effects)],
             "rounded": [getattr(own.pairs[k][0], "rounded", False) for k in candidate.effects],
-            "theta": np.asarray(own.margins.theta(x[: own.d])).tolist(),
+            "theta": own.margins.theta(x[: own.d]).tolist(),
             "values": list(own.values(candidate, x).values()),
             "spread": diagnosis.spreads[name].tolist(),
         }

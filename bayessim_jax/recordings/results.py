@@ -6,7 +6,6 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from jaxtyping import Float
@@ -109,7 +108,7 @@ def _write_laplace(path: Path, diagnosis: CaseDiagnosis, seed: int) -> None:
 
     def group(z: np.ndarray) -> xr.Dataset:
         draws = {
-            name: (("chain", "draw"), np.asarray(margin.value(jnp.asarray(z[:, k])))[None], {"units": unit})
+            name: (("chain", "draw"), margin.value(z[:, k])[None], {"units": unit})
             for k, (name, unit, margin) in enumerate(zip(names, units, each, strict=True))
         }
         return xr.Dataset(draws)

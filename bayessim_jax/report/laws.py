@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from bayessim_jax.diagnosis.belief import covariance_of
 from bayessim_jax.effects.contract import Moment
@@ -119,12 +120,15 @@ def _curves(
         "drive": 0.5 * scales.force,
         "detail": place.partition("#")[2],
     }
-    if over != "command":
-        state[over] = jnp.asarray(x)
-        moment = Moment(**state)
-        found = effect.force(values, (), moment)[0]
-    else:
-        found = effect.command(values, (), jnp.asarray(x), Moment(**state))[0]
+
+    @jax.jit  # one program, not one for every operation
+    def law(values: Mapping[str, Array], x: Array) -> Array:
+        if over == "command":
+            return effect.command(values, (), x, Moment(**state))[0]
+        at: dict[str, Any] = {**state, over: x}
+        return effect.force(values, (), Moment(**at))[0]
+
+    found = law(dict(values), jnp.asarray(x))
     return np.broadcast_to(np.asarray(found), (DRAWS + 1, len(x)))
 
 
