@@ -97,7 +97,7 @@ class CaseModel:
     @property
     def nearest(self) -> int:
         """Time steps in one of the model's own with which simulations come nearest to what was recorded."""
-        if self.step_error is None:
+        if self.step_error is None or 0.0 in self.step_error.nodes:
             return self.refined
         ratio = self.step_error.ratio
         return min((1, REFINED), key=lambda refined: abs(1 / refined - ratio))
@@ -192,6 +192,7 @@ class StepError:
     """What the time step of a simulation does to predictions, at one z: simulations of several steps, interpolated.
 
     With steps s_k h and predictions y_k, that of a step s h is y(s) = Σ_k L_k(s) y_k, L_k Lagrange's polynomials.
+    Beside those of semi-implicit Euler a step of Runge and Kutta is as good as none, s = 0.
     """
 
     models: tuple[CaseModel, ...]
@@ -204,12 +205,14 @@ class StepError:
     @property
     def nodes(self) -> tuple[float, ...]:
         """Each s_k."""
-        return tuple(1 / model.refined for model in self.models)
+        none = [is_runge_kutta(model) for model in self.models]
+        mixed = any(none) and not all(none)
+        return tuple(0.0 if mixed and own else 1 / m.refined for own, m in zip(none, self.models, strict=True))
 
     def runs(
         self, shots: Shots, refined: int, delta: Float[Array, "windows n"] | None = None
     ) -> Float[np.ndarray, "windows nodes rows obs"]:
-        """Predictions y_k less those with h / `refined`; zero where nothing was measured."""
+        """Predictions y_k less those of the first model with h / `refined`; zero where nothing was measured."""
         predicts: list[Predict] = [predictor(m) for m in self.models]
         if self.answer is not None:
             bench, candidate = self.answer
@@ -217,13 +220,25 @@ class StepError:
             simulator = bench.simulator(candidate)
             predicts = [dataclasses.replace(simulator, system=m.system) for m in self.models]
         each = [predict_windows(predict, shots, self.z, delta) for predict in predicts]
-        found = np.stack([y - each[self.nodes.index(1 / refined)] for y in each], axis=1)
+        base = each[[model.refined for model in self.models].index(refined)]
+        found = np.stack([y - base for y in each], axis=1)
         there = np.asarray(shots.measured) & np.isfinite(found).all(1)
         return np.where(there[:, None], found, 0.0)
 
     def offset(self, shots: Shots, refined: int) -> Float[np.ndarray, "windows rows obs"]:
         """What has to be added to predictions of a simulation with h / `refined`."""
         return interpolate(self.nodes, self.ratio, tame(self.runs(shots, refined), shots))
+
+
+def is_runge_kutta(model: CaseModel) -> bool:
+    """Whether a simulation takes steps of Runge and Kutta."""
+    return bool(model.compiled.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4)
+
+
+def with_euler_steps(model: CaseModel) -> CaseModel:
+    """The same case, simulated with steps of semi-implicit Euler."""
+    case = dataclasses.replace(model.case, lateness=dataclasses.replace(model.case.lateness, stepped=True))
+    return case_model(case, engine=model.engine_name, before=model.before, refined=model.refined)
 
 
 def interpolate(

@@ -30,7 +30,7 @@ from bayessim_jax.diagnosis.verdict import Entry
 from bayessim_jax.diagnosis.whiteness import difference_noise
 from bayessim_jax.inference.direct import estimate_noise, fit_direct, noise_floor
 from bayessim_jax.inference.replay import Inputs, Restarted
-from bayessim_jax.inference.shooting import Fit, Predict, Shots, eliminate, normal_equations
+from bayessim_jax.inference.shooting import FEW_CALLS, Fit, Predict, Shots, eliminate, normal_equations
 from bayessim_jax.programs import trace_once
 from bayessim_jax.recordings.late import BLUR, measure_lag
 from bayessim_jax.recordings.shots import (
@@ -39,9 +39,11 @@ from bayessim_jax.recordings.shots import (
     StepError,
     case_model,
     interpolate,
+    is_runge_kutta,
     lagrange,
     predictor,
     tame,
+    with_euler_steps,
 )
 from bayessim_jax.recordings.windows import Windows
 
@@ -49,6 +51,8 @@ __all__ = ["Settled", "ratio_of_motion", "settle_answer", "settle_step"]
 
 TOLERABLE = 1.0
 """Of the noise: with a larger error of the time step the finer simulation is the one that is used."""
+SLIGHT = 0.1
+"""Of the noise: with a larger one finer steps of Runge and Kutta are, beside those of semi-implicit Euler."""
 INVISIBLE = 0.2
 """Of the noise of an average over all rows: a smaller error changes no posterior."""
 SURE = 0.25
@@ -115,10 +119,15 @@ def settle_step(
     that are missing; where it finds no step that there could be, or positions and velocities tell of a shorter one,
     these are believed (`ratio_of_motion`). What they tell may be too long: velocities are often late themselves, by the
     filter that they come from.
+
+    A model that takes steps of Runge and Kutta may be believed of what took those of semi-implicit Euler, whose
+    positions are ahead by h/2 of their motion. Where velocities are measured these tell (`late`); else s is fitted,
+    between none for Runge and Kutta's steps and one for Euler's of the model's own length.
     """
     margins = model.margins + Margins.create(["time step"], [RATIO])
     shots = model.shots(windows)
-    nodes = (1.0, 1 / REFINED)
+    mixed = _is_mixed(model)
+    nodes = (0.0, 1.0, 1 / REFINED) if mixed else (1.0, 1 / REFINED)
     predict = Stepped(predictor(model), nodes)
     first = _with_runs(shots, np.zeros((len(shots.y), len(nodes), *shots.y.shape[1:])))
     fit = fit_direct(key, predict, first, margins.size, step=model.step, say=say)
@@ -127,12 +136,21 @@ def settle_step(
     finer = case_model(model.case, engine=model.engine_name, before=model.before, refined=REFINED)
     error = StepError((model, finer), fit.z[:-1])
     runs = error.runs(shots, 1, fit.delta)
-    limit = interpolate(nodes, 0.0, runs)
+    limit = interpolate(error.nodes, 0.0, runs)
     size, counts = _size(shots, fit, limit)
-    if size * np.sqrt(counts) < INVISIBLE:
+    visible = size * np.sqrt(counts) >= INVISIBLE
+    h = model.system.dt / model.system.substeps
+    times = f"the integration error is {size:.2g} times the noise"
+    remark = f"time step {h / REFINED:g} s instead of {h:g} s: {times}"
+    if mixed:
+        exact = finer if size > SLIGHT and not model.step else model
+        error = StepError((exact, *map(with_euler_steps, (model, finer))), fit.z[:-1])
+        runs = error.runs(shots, exact.refined, fit.delta)
+        most, counts = _size(shots, fit, interpolate(error.nodes, 1.0, runs))
+        visible = visible or most * np.sqrt(counts) >= INVISIBLE
+    if not visible:
         return Settled(model, fit, predict, first, margins, SURE * limit)
-
-    moved = ratio_of_motion(model, windows)
+    moved = (0.0, RATIO.b) if mixed else ratio_of_motion(model, windows)
 
     def refit(base: CaseModel, predict: Predict, error: StepError, runs: np.ndarray) -> Settled:
         found = fit
@@ -152,21 +170,32 @@ def settle_step(
         ratio = float(np.clip(ratio, 0.0, 1.0))
         wild = np.where(calm.any(1), 0.0, np.abs(runs).max(1))
         base = dataclasses.replace(base, step_error=dataclasses.replace(error, z=found.z[:-1], ratio=ratio))
-        uncertain = max(sd, SURE) * _along(error.nodes, ratio, calm) + wild
+        least = SURE * ratio if mixed else SURE  # of steps of Runge and Kutta there is nothing to interpolate
+        uncertain = max(sd, least) * _along(error.nodes, ratio, calm) + wild
         return Settled(base, found, predict, seen, margins, uncertain, moved, told=moved[1] < RATIO.b)
 
+    def told(found: Settled) -> Settled:
+        say(remark)
+        return dataclasses.replace(
+            found, model=dataclasses.replace(found.model, remarks=(*found.model.remarks, remark))
+        )
+
+    if mixed:
+        found = refit(exact, Stepped(predictor(exact), error.nodes), error, runs)
+        return found if exact is model else told(found)
     if size > TOLERABLE and not model.step:
         finest = case_model(model.case, engine=model.engine_name, before=model.before, refined=REFINED**2)
         wide = StepError((model, finer, finest), fit.z[:-1])
         again = refit(finer, Stepped(predictor(finer), wide.nodes), wide, wide.runs(shots, REFINED, fit.delta))
         if float((np.log(np.asarray(fit.sigma) / np.asarray(again.fit.sigma))).mean()) > -0.01:
-            h = model.system.dt / model.system.substeps
-            times = f"the integration error is {size:.1f} times the noise"
-            remark = f"time step {h / REFINED:g} s instead of {h:g} s: {times}"
-            say(remark)
-            told = dataclasses.replace(again.model, remarks=(*again.model.remarks, remark))
-            return dataclasses.replace(again, model=told)
+            return told(again)
     return refit(model, predict, error, runs)
+
+
+def _is_mixed(model: CaseModel) -> bool:
+    """Whether a model takes steps of Runge and Kutta, and no velocities tell whether what was recorded did."""
+    shown = any(r.qvel_measured.any() for r in model.case.recordings)
+    return not isinstance(model.system, Restarted) and is_runge_kutta(model) and not shown
 
 
 def settle_answer(
@@ -235,7 +264,7 @@ def _infer_ratio(
     return float(mean + sd * (z[k] + move[k])), float(sd * width[k]), wide
 
 
-@trace_once(to_numpy=True)
+@trace_once(compiler_options=FEW_CALLS, to_numpy=True)
 def _step_all(r: Array, slopes: Array, z: Array, scaled: Array) -> tuple[Array, Array, Array, Array]:
     """Precision of all of z and every window's pull on it, a Gauss-Newton step, and its standard deviations."""
     c = normal_equations(r, slopes, z, scaled)

@@ -4,6 +4,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -86,6 +87,26 @@ def test_the_step_of_what_was_recorded_is_found_and_does_not_bend_parameters(tmp
     assert (np.abs(np.asarray(settled.fit.z[:-1]) - truth) < 4 * sd[:-1]).all()
     plain = fit_direct(jax.random.key(0), predictor(model), model.shots(windows), 2)
     assert (np.abs(np.asarray(plain.z) - truth) > 8 * sd[:-1]).any()
+
+
+@pytest.mark.parametrize(
+    ("rig", "finer"), [("slide", 0.5), ("slide", 16.0), pytest.param("double", 0.5, marks=pytest.mark.slow)]
+)
+def test_steps_of_euler_show_in_positions_alone_where_those_of_runge_and_kutta_are_believed(tmp_path, rig, finer):
+    settings = {"noise": 0.1, "rate": 125.0, "recordings": 4, "seconds": 3.0, "velocities": False, "seed": 2}
+    sealed = make_case(tmp_path / "case", rig, finer=finer, **settings)
+    path = tmp_path / "case" / "model.xml"
+    spec = mujoco.MjSpec.from_file(str(path))
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    path.write_text(spec.to_xml())
+    model = case_model(load_case(tmp_path / "case").check())
+    settled = settle_step(jax.random.key(0), model, split_windows(model)[0])
+    assert settled.model.step_error.nodes == (0.0, 1.0, 0.25)
+    assert settled.model.nearest == settled.model.refined
+    assert settled.model.step_error.ratio == pytest.approx(0.25 / finer, abs=0.03)
+    sd = np.sqrt(np.diag(np.linalg.inv(np.asarray(settled.fit.precision))))
+    truth = np.asarray(model.margins.standard(jnp.array(list(sealed["parameters"].values()))))
+    assert (np.abs(np.asarray(settled.fit.z[:-1]) - truth) < 4 * sd[:-1]).all()
 
 
 @pytest.mark.parametrize("rig", ["slide", pytest.param("double", marks=pytest.mark.slow)])
