@@ -105,6 +105,8 @@ class Thresholds:
     """The same for more effects than one, which come near to more that is none of them."""
     most: float = 0.1
     """The same product, above which an effect explains nothing, though no misfit of pieces can be detected."""
+    bulk: float = 0.5
+    """Share of the misfit alone, above which it does not where predictions ahead cannot tell, either."""
     foreseen: float = 0.003
     """Share of the baseline's error of predictions ahead, below which what pieces leave is the sensors' own."""
     chief: float = 0.03
@@ -427,7 +429,8 @@ def explains(entry: Entry, none: Entry, thresholds: Thresholds) -> bool:
     """
     foreseen = entry.ahead <= thresholds.foreseen and bool(entry.misfit.judged.all())
     left, both = share_left(entry.misfit, none.misfit), thresholds.both if len(entry.names) < 2 else thresholds.several
-    if foreseen or (entry.misfit.p_value >= FALSE_ALARMS and not left * entry.ahead > thresholds.most):
+    vague = left > thresholds.bulk if np.isnan(entry.ahead) else left * entry.ahead > thresholds.most
+    if foreseen or (entry.misfit.p_value >= FALSE_ALARMS and not vague):
         return True
     return left <= thresholds.left and not (entry.ahead > thresholds.ahead or left * entry.ahead > both)
 
