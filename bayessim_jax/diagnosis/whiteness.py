@@ -76,11 +76,13 @@ def _slow(r: Float[np.ndarray, "windows rows obs"], cosines: np.ndarray) -> Floa
 
 
 def _basis(columns: Float[np.ndarray, "windows k c"]) -> Float[np.ndarray, "windows k c"]:
-    """Orthonormal columns with the span of some, and zeros where these depend on others, as what is known does."""
-    q, r = np.linalg.qr(columns)
-    size = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
+    """Orthonormal columns with the span of some, and zeros where these depend on others, as what is known does.
+
+    Of no other directions, as a factorization without pivots has where a column is zero.
+    """
+    directions, size, _ = np.linalg.svd(columns, full_matrices=False)
     least = ROUNDED * np.finfo(size.dtype).eps * size.max(-1, keepdims=True)
-    return q * (size > least)[:, None]
+    return directions * (size > least)[:, None]
 
 
 def _noise_left(

@@ -52,6 +52,22 @@ def test_what_moves_no_prediction_absorbs_nothing():
     np.testing.assert_allclose(alone.excess, beside.excess, rtol=1e-4)
 
 
+def test_what_moves_no_prediction_takes_no_part_of_what_others_move():
+    """Where rows are missing the diagnosis of a crane had ended in an error for it."""
+    rng, (windows, rows) = np.random.default_rng(3), (5, 30)
+    measured = np.ones((windows, rows, 2), bool)
+    measured[:, 0] = False
+    draw = lambda: np.where(measured, rng.standard_normal((windows, rows, 2)).cumsum(1), 0.0)  # noqa: E731
+    one, two, three = (draw().reshape(windows, 1, -1) for _ in range(3))
+    noise = np.where(measured, rng.standard_normal((windows, rows, 2)), 0.0)
+    alone, beside = (
+        judge_misfit(jax.random.key(0), noise, jax.numpy.asarray(np.concatenate(slopes, axis=1)), measured)
+        for slopes in ((one, two, three), (one, two, np.zeros_like(one), three))
+    )
+    np.testing.assert_allclose(alone.excess, beside.excess, atol=1e-4)
+    assert alone.p_value == beside.p_value
+
+
 def test_windows_that_do_not_count_are_no_evidence_before_or_after():
     """An effect that remembers is off where its past is unknown: these windows are left out on both sides."""
     rng, (windows, rows) = np.random.default_rng(2), (20, 40)
