@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from bayessim_jax.recordings.layout import Layout
     from bayessim_jax.recordings.recording import CaseRecording
 
-__all__ = ["BLUR", "Lateness", "find_late", "measure_lag", "without_velocities"]
+__all__ = ["BLUR", "Lateness", "find_late", "is_runge_kutta", "measure_lag", "without_velocities"]
 
 PIECE, FEWEST = 0.15, 30
 """Seconds over which positions and velocities are compared, and how many such pieces it takes at least."""
@@ -80,8 +80,13 @@ def find_late(
                 named = (r.name for r in recordings if r.qvel_measured[:, v].any())
                 found += [Finding("warning", file, what, remedy) for file in named]
             elif lag > least and lag * moves > VISIBLE * noise:
-                stepped = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+                stepped = is_runge_kutta(model)
     return Lateness(tuple(late), stepped), found
+
+
+def is_runge_kutta(model: mujoco.MjModel) -> bool:
+    """Whether a model takes steps of Runge and Kutta."""
+    return bool(model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4)
 
 
 def without_velocities(

@@ -20,6 +20,7 @@ from bayessim_jax.contracts import Box
 from bayessim_jax.inference.replay import Inputs, Replay, Restarted
 from bayessim_jax.inference.scores import predict_windows
 from bayessim_jax.inference.shooting import Predict, Shots
+from bayessim_jax.recordings.late import is_runge_kutta
 from bayessim_jax.recordings.priors import LogNormal, Normal, Prior
 from bayessim_jax.recordings.recording import CaseRecording, resample
 from bayessim_jax.recordings.smoothing import smooth_recordings
@@ -46,6 +47,7 @@ __all__ = [
     "split_windows",
     "take",
     "tame",
+    "with_euler_steps",
 ]
 
 REFINED = 4
@@ -205,7 +207,7 @@ class StepError:
     @property
     def nodes(self) -> tuple[float, ...]:
         """Each s_k."""
-        none = [is_runge_kutta(model) for model in self.models]
+        none = [is_runge_kutta(model.compiled) for model in self.models]
         mixed = any(none) and not all(none)
         return tuple(0.0 if mixed and own else 1 / m.refined for own, m in zip(none, self.models, strict=True))
 
@@ -228,11 +230,6 @@ class StepError:
     def offset(self, shots: Shots, refined: int) -> Float[np.ndarray, "windows rows obs"]:
         """What has to be added to predictions of a simulation with h / `refined`."""
         return interpolate(self.nodes, self.ratio, tame(self.runs(shots, refined), shots))
-
-
-def is_runge_kutta(model: CaseModel) -> bool:
-    """Whether a simulation takes steps of Runge and Kutta."""
-    return bool(model.compiled.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4)
 
 
 def with_euler_steps(model: CaseModel) -> CaseModel:

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
@@ -32,14 +31,13 @@ from bayessim_jax.inference.direct import estimate_noise, fit_direct, noise_floo
 from bayessim_jax.inference.replay import Inputs, Restarted
 from bayessim_jax.inference.shooting import FEW_CALLS, Fit, Predict, Shots, eliminate, normal_equations
 from bayessim_jax.programs import trace_once
-from bayessim_jax.recordings.late import BLUR, measure_lag
+from bayessim_jax.recordings.late import BLUR, is_runge_kutta, measure_lag
 from bayessim_jax.recordings.shots import (
     REFINED,
     CaseModel,
     StepError,
     case_model,
     interpolate,
-    is_runge_kutta,
     lagrange,
     predictor,
     tame,
@@ -140,8 +138,7 @@ def settle_step(
     size, counts = _size(shots, fit, limit)
     visible = size * np.sqrt(counts) >= INVISIBLE
     h = model.system.dt / model.system.substeps
-    times = f"the integration error is {size:.2g} times the noise"
-    remark = f"time step {h / REFINED:g} s instead of {h:g} s: {times}"
+    remark = f"time step {h / REFINED:g} s instead of {h:g} s: the integration error is {size:.1f} times the noise"
     if mixed:
         exact = finer if size > SLIGHT and not model.step else model
         error = StepError((exact, *map(with_euler_steps, (model, finer))), fit.z[:-1])
@@ -195,7 +192,7 @@ def settle_step(
 def _is_mixed(model: CaseModel) -> bool:
     """Whether a model takes steps of Runge and Kutta, and no velocities tell whether what was recorded did."""
     shown = any(r.qvel_measured.any() for r in model.case.recordings)
-    return not isinstance(model.system, Restarted) and is_runge_kutta(model) and not shown
+    return not isinstance(model.system, Restarted) and is_runge_kutta(model.compiled) and not shown
 
 
 def settle_answer(
@@ -294,7 +291,7 @@ def ratio_of_motion(model: CaseModel, windows: Windows) -> tuple[float, float]:
     """
     m = model.compiled
     found: list[tuple[float, float]] = [(RATIO.a, RATIO.b)]
-    if m.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
+    if not is_runge_kutta(m):
         for _, q, v in model.case.layout.single:
             there = windows.qpos_measured[:, :, q] & windows.qvel_measured[:, :, v]
             lags = measure_lag(windows.time, windows.qpos[:, :, q], windows.qvel[:, :, v], there)
