@@ -14,6 +14,7 @@ from bayessim_jax.recordings.shots import case_model, split_windows
 from bayessim_jax.recordings.stepping import ratio_of_motion
 from benchmarks.strangers import STEP, draw_strangers, make_stranger
 from benchmarks.worlds import make_case
+from tests.recordings.made_up_case import MODEL, columns, write_case
 
 TAU = 0.006
 
@@ -96,6 +97,23 @@ def test_velocities_from_backward_differences_are_half_a_row_late(prompt, tmp_pa
         np.savetxt(path, table, delimiter=",", header=names, comments="", fmt="%.10g")
     (told,) = [f for f in load_case(folder).findings if "later" in f.what]
     assert float(re.search(r"is ([\d.]+) ms later", told.what)[1]) == pytest.approx(4.0, abs=0.2)
+
+
+@pytest.mark.parametrize(("kv", "tau"), [(2.0, 0.0), (0.2, TAU)])
+def test_a_velocity_that_jumps_where_a_command_does_is_not_late(tmp_path, kv, tau):
+    """A stiff servo follows a command within a row, so that a velocity is that of the row before; a filter is found."""
+    servo = f'<position name="motor" joint="hinge" kp="{10.0 * kv}" kv="{kv}"/>'
+    model = re.sub("<motor .*/>", servo, MODEL).replace('mass="0.3"', 'mass="0.01"')
+    compiled, rows, rng = mujoco.MjModel.from_xml_string(model), 600, np.random.default_rng(0)
+    data, table = mujoco.MjData(compiled), np.zeros((600, 4))
+    for k in range(rows):
+        data.ctrl[0] = np.sin(0.05 * k) + 0.1 * rng.standard_normal()
+        table[k] = data.time, data.qpos[0], data.qvel[0], data.ctrl[0]
+        mujoco.mj_step(compiled, data, 5)
+    folder = write_case(tmp_path / "case", model=model, run1=dict(zip(columns(), table.T, strict=True)))
+    if tau:
+        _filter(folder / "recordings" / "run1.csv", tau)
+    assert load_case(folder).lateness == Lateness(("joint/hinge/qvel",) if tau else ())
 
 
 def test_recordings_that_come_later_are_read_alike(late, prompt):
