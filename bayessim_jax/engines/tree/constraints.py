@@ -157,6 +157,14 @@ def _sticking(c: Constraint, row: _Row) -> tuple[Folded, Folded]:
     return (row.gain, row.gain * row.reference) if c.side == 0 else (fold(0.0), fold(0.0))
 
 
+class _Search(NamedTuple):
+    """Steps taken, where they led, and whether that is the solution."""
+
+    count: Scalar
+    here: tuple[Scalar, ...]
+    found: Scalar
+
+
 class _Problem(NamedTuple):
     """M a = right + f(a), whose solution is the least of a convex function with the gradient M a − right − f(a)."""
 
@@ -172,17 +180,25 @@ class _Problem(NamedTuple):
         return _Problem(self.constraints, rows, matrix, [_stop(x) for x in self.right])
 
     def find(self) -> list[Folded]:
-        """The solution, up to rounding."""
+        """The solution, up to rounding: found once what solves for some pieces is on these itself."""
+        rounds = 2 + 2 * len({c.joint for c in self.constraints})
 
-        def improve(accelerations: tuple[Scalar, ...], _: None) -> tuple[tuple[Scalar, ...], None]:
-            here = [fold(x) for x in accelerations]
-            return tuple(x.value for x in self.search(here, self.solve_pieces(self.pieces(here)))), None
+        def goes_on(carry: _Search) -> Scalar:
+            return (carry.count < rounds) & ~carry.found
+
+        def improve(carry: _Search) -> _Search:
+            here = [fold(x) for x in carry.here]
+            pieces = self.pieces(here)
+            there = self.solve_pieces(pieces)
+            found = _same(pieces, self.pieces(there))
+            nearer = [_pick(found, a, b).value for a, b in zip(there, self.search(here, there), strict=True)]
+            return _Search(carry.count + 1, tuple(nearer), found)
 
         start = self.solve_pieces([_sticking(c, row) for c, row in zip(self.constraints, self.rows, strict=True)])
-        rounds = 2 + 2 * len({c.joint for c in self.constraints})
+        begun = _Search(jnp.zeros((), int), tuple(x.value for x in start), jnp.zeros((), bool))
         with jax.named_scope(SOLVER):
-            found, _ = jax.lax.scan(improve, tuple(x.value for x in start), length=rounds)
-        return [fold(x) for x in found]
+            found = jax.lax.while_loop(goes_on, improve, begun)
+        return [fold(x) for x in found.here]
 
     def pieces(self, accelerations: Sequence[Folded]) -> list[tuple[Folded, Folded]]:
         """The piece of every constraint's force that holds at accelerations."""
@@ -228,6 +244,12 @@ class _Problem(NamedTuple):
 
     def _smooth_gradient(self, accelerations: Sequence[Folded]) -> list[Folded]:
         return [_inner(row, accelerations) - b for row, b in zip(self.matrix, self.right, strict=True)]
+
+
+def _same(a: Sequence[tuple[Folded, Folded]], b: Sequence[tuple[Folded, Folded]]) -> Scalar:
+    """Whether the slopes and offsets of pieces are the same."""
+    pairs = [(x.value, y.value) for one, two in zip(a, b, strict=True) for x, y in zip(one, two, strict=True)]
+    return jnp.all(jnp.stack([jnp.asarray(x == y) for x, y in pairs]))
 
 
 def _inner(a: Sequence[Folded], b: Sequence[Folded]) -> Folded:
