@@ -205,8 +205,8 @@ def load_repaired(path: Path) -> Repaired:
             raise ValueError(f"{path} is of the registered system {name}; train on that: bayessim online {name}.")
         verdict = str(table["verdict"])
         which = "augmented" if verdict in ("explained", "ambiguous") else "baseline"
-        # a controller may bring together what never touched in the recordings
-        model = case_model(case, engine=str(config["engine"]), refined=int(state["refined"]), contacts=True)
+        # a controller may bring together what never touched in the recordings, or a joint to its limits
+        model = case_model(case, engine=str(config["engine"]), refined=int(state["refined"]), whole=True)
         simulator, mean = simulator_of(model, state, which)
         sds = [entry[which]["sd"] for entry in table["parameters"].values()]
         sds += [p["sd"] for effect in table["effects"] for p in effect["parameters"].values()]

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from bayessim_jax.beliefs.margins import Margin, Margins, log_normal, normal, uniform
 from bayessim_jax.contracts import Box
+from bayessim_jax.engines.tree import find_refusals
 from bayessim_jax.inference.replay import Inputs, Replay, Restarted
 from bayessim_jax.inference.scores import predict_windows
 from bayessim_jax.inference.shooting import Predict, Shots
@@ -25,7 +26,7 @@ from bayessim_jax.recordings.priors import LogNormal, Normal, Prior
 from bayessim_jax.recordings.recording import CaseRecording, resample
 from bayessim_jax.recordings.smoothing import smooth_recordings
 from bayessim_jax.recordings.splitting import choose_held_out, describe_inputs
-from bayessim_jax.recordings.touching import drop_contacts
+from bayessim_jax.recordings.unreached import drop_contacts, drop_limits
 from bayessim_jax.recordings.windows import Windows, stack_windows
 from bayessim_jax.systems.mjcf import MjcfSystem, Unknown, mjcf_system
 
@@ -284,14 +285,14 @@ def _rows(windows: Windows) -> Bool[np.ndarray, "windows rows"]:
 
 
 def case_model(
-    case: LoadedCase, *, engine: str = "auto", before: float = 0.0, refined: int = 1, contacts: bool = False
+    case: LoadedCase, *, engine: str = "auto", before: float = 0.0, refined: int = 1, whole: bool = False
 ) -> CaseModel:
     """Make a case's system, on a time step that its recordings' rows are a whole number of steps apart.
 
     With `refined` the simulation takes so many steps for one of the model's. Recordings whose rows are not evenly
     spaced, or at another rate than the others, are put on a uniform grid. Contacts are left out where the tree engine
-    takes the model without them and nothing touches in the recordings, unless they are asked for. Raises `ValueError`
-    for what the engine does not take.
+    takes the model without them and nothing touches in the recordings, and limits that these do not come near, unless
+    the `whole` model is asked for. Raises `ValueError` for what the engine does not take.
     """
     restarted = _restarted(case) if case.model is None else None
     dt = restarted.dt if restarted else float(np.median([r.step for r in case.recordings]))
@@ -330,8 +331,12 @@ def case_model(
         if any(getattr(r, mask)[:, i].any() for r in recordings)
     }
     channels = tuple(c for c in (*layout.qpos, *layout.qvel, *layout.sensors) if c in measured)
-    if engine in ("auto", "tree") and not contacts and drop_contacts(spec, case.recordings):
-        remarks.append("contacts are left out: nothing touches in the recordings")
+    if engine in ("auto", "tree") and not whole:
+        if drop_contacts(spec, case.recordings):
+            remarks.append("contacts are left out: nothing touches in the recordings")
+        if not find_refusals(spec.compile()) and (count := drop_limits(spec, case.recordings)):
+            what = "limits of one joint" if count == 1 else f"limits of {count} joints"
+            remarks.append(f"{what} are left out: the recordings do not come near")
     unknowns = [Unknown(p.name, tuple(str(t) for t in p.targets), *_bounds(p.prior), p.unit) for p in case.parameters]
     system = mjcf_system(spec, unknowns, observe=channels, substeps=substeps, engine=engine)
     return CaseModel(case, system, margins_of(case), tuple(recordings), channels, tuple(remarks), before, refined)

@@ -1,4 +1,8 @@
-"""Models without the contacts that are made in no recording: the engine that is fast and smooth takes those."""
+"""Models without the contacts and limits that no recording reaches.
+
+Without contacts the engine that is fast and smooth takes them. A limit is solved for at every time step, reached or
+not: an arm of seven limited joints takes many times as long as without.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +14,17 @@ import numpy as np
 from jaxtyping import Float
 
 from bayessim_jax.engines.tree import find_refusals
+from bayessim_jax.recordings.layout import HINGE, SLIDE
 from bayessim_jax.recordings.recording import CaseRecording
 
-__all__ = ["drop_contacts"]
+__all__ = ["drop_contacts", "drop_limits"]
 
 ROWS = 200
 """Rows of a recording that are looked at, spread evenly."""
 NEAR = 0.01
-"""Of the model's extent: geoms that come nearer than this count as touching."""
+"""Of the model's extent: geoms that come nearer than this may count as touching."""
+SHARE = 0.1
+"""Of what a distance, between two geoms or to a limit, changes by: what counts as near is smaller than that."""
 
 
 def drop_contacts(spec: mujoco.MjSpec, recordings: Sequence[CaseRecording]) -> bool:
@@ -33,12 +40,48 @@ def drop_contacts(spec: mujoco.MjSpec, recordings: Sequence[CaseRecording]) -> b
     return True
 
 
+def drop_limits(spec: mujoco.MjSpec, recordings: Sequence[CaseRecording]) -> int:
+    """Disable the limits of hinges and slides that are measured and stay away from them; says of how many joints."""
+    model, count = spec.compile(), 0
+    for joint in spec.joints:
+        single = model.jnt_type[joint.id] in (SLIDE, HINGE)
+        if single and model.jnt_limited[joint.id] and _stays_away(model, joint.id, recordings):
+            joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
+            count += 1
+    return count
+
+
+def _stays_away(model: mujoco.MjModel, joint: int, recordings: Sequence[CaseRecording]) -> bool:
+    """Whether every recording shows a joint's position, and none near a limit."""
+    q, (low, high) = model.jnt_qposadr[joint], model.jnt_range[joint]
+    seen = [r.qpos[r.qpos_measured[:, q], q] for r in recordings]
+    if not all(part.size for part in seen):
+        return False
+    least, most = min(part.min() for part in seen), max(part.max() for part in seen)
+    return bool(min(least - low, high - most) - model.jnt_margin[joint] > SHARE * (most - least))
+
+
 def _touches(model: mujoco.MjModel, recordings: Iterable[CaseRecording]) -> bool:
-    """Whether two geoms that may collide come near each other in a recorded pose."""
+    """Whether two geoms that may collide come near each other in a recorded pose.
+
+    Neighbours along a chain are near each other by design, at a distance that hardly changes: what counts as near is
+    less than a share of that by which a distance changes in all recordings, too.
+    """
+    poses = [pose for recording in recordings for pose in _poses(recording)]
     wide = copy.copy(model)
-    wide.geom_margin[:] = model.geom_margin + NEAR * model.stat.extent
-    data = mujoco.MjData(wide)
-    return any(_touch(wide, data, pose) for recording in recordings for pose in _poses(recording))
+    wide.geom_margin[:] += NEAR * model.stat.extent
+    wide.body_margin[:] += NEAR * model.stat.extent
+    data, pairs = mujoco.MjData(wide), set[tuple[int, int]]()
+    for pose in poses:
+        _place(wide, data, pose)
+        mujoco.mj_collision(wide, data)
+        pairs |= {(int(c.geom1), int(c.geom2)) for c in data.contact}
+    distances = np.zeros((len(poses), len(pairs)))
+    for row, pose in zip(distances, poses, strict=True):
+        _place(model, data, pose)
+        row[:] = [mujoco.mj_geomDistance(model, data, *pair, model.stat.extent, None) for pair in pairs]
+    limits = np.array([model.geom_margin[list(pair)].sum() for pair in pairs]) + SHARE * np.ptp(distances, axis=0)
+    return bool((distances.min(axis=0) <= limits).any()) if pairs else False
 
 
 def _poses(recording: CaseRecording) -> Iterable[Float[np.ndarray, " nq"]]:
@@ -46,9 +89,7 @@ def _poses(recording: CaseRecording) -> Iterable[Float[np.ndarray, " nq"]]:
     return (pose for pose in recording.qpos[rows] if np.isfinite(pose).all())
 
 
-def _touch(model: mujoco.MjModel, data: mujoco.MjData, pose: Float[np.ndarray, " nq"]) -> bool:
+def _place(model: mujoco.MjModel, data: mujoco.MjData, pose: Float[np.ndarray, " nq"]) -> None:
     data.qpos[:] = pose
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
-    mujoco.mj_collision(model, data)
-    return data.ncon > 0
