@@ -123,3 +123,10 @@ def test_a_tutorial_writes_its_page_and_report(tmp_path):
     assert "| verdict | | `no_mismatch` |" in page
     assert "bayessim conceal docs/examples/pendulum/pendulum.xml --seed 1 --out clean" in page
     assert (tmp_path / "tutorials" / "clean.html").stat().st_size > 100_000
+
+
+@pytest.mark.slow
+def test_strikes_reach_farther_on_less_friction():
+    said = run("slide_reach.py", "--frictions", 0.1, 1.5, "--tries", 16, "--generations", 1).splitlines()
+    slippery, rough = (float(line.split("at most ")[1].split()[0]) for line in said)
+    assert slippery > rough > 0.0
