@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
     from bayessim_jax.concealment.law import Spot
 
-__all__ = ["Bristle", "RoundSign", "draw_rounding", "grip"]
+__all__ = ["ROUND", "Bristle", "RoundSign", "draw_rounding", "grip"]
 
 STIFF = 0.3
 """ω h of a joint on its bristles."""
@@ -55,11 +55,11 @@ class RoundSign:
 
 
 def draw_rounding(spot: Spot, level: float, rng: np.random.Generator) -> float:
-    """ε of friction of a level, rad/s or m/s; 0 in half of all machines."""
+    """ε of friction of a level, rad/s or m/s; 0 in half of all machines, and where ε would be most of the speed."""
     low, high = ROUND
     width = math.exp(rng.uniform(math.log(low), math.log(high))) * spot.speed
     least = STABLE * abs(level) * spot.h / spot.inertia
-    return max(width, least) if rng.uniform() < 0.5 else 0.0
+    return max(width, least) if rng.uniform() < 0.5 and least <= high * spot.speed else 0.0
 
 
 def grip(spot: Spot, rounding: float) -> Bristle | RoundSign:

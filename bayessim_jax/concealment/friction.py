@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from bayessim_jax.concealment.bristle import STIFF, draw_rounding, grip
+from bayessim_jax.concealment.bristle import ROUND, STIFF, draw_rounding, grip
 from bayessim_jax.concealment.law import ForceLaw, ModelLaw, Spot
 from bayessim_jax.concealment.places import driven_joints
 
@@ -29,6 +29,9 @@ __all__ = [
 
 BRAKED = 1 / 3
 """Share of machines whose Coulomb friction is a constraint of MuJoCo's own solver."""
+BRAKING = 945.0
+"""1/s: the acceleration against a speed below which such a constraint creeps, over that speed, by MuJoCo's defaults
+b d/(1 − d) with b = 2/(0.95 · 0.02 s) and d = 0.9."""
 SHARP = 0.2
 """Of Stribeck's velocity: a sign that is rounded over more of it hides what falls there."""
 
@@ -88,10 +91,11 @@ class CoulombFriction(DryFriction):
 
     @classmethod
     def make(cls, spot: Spot, amplitude: float, rng: np.random.Generator) -> CoulombFriction | Brake:
-        """F_c in units of the joint's force."""
+        """F_c in units of the joint's force; a `Brake` creeps at no more of the speed than a rounded sign."""
         level = amplitude * spot.force
-        rounding = draw_rounding(spot, level, rng)
-        return Brake.make(spot, amplitude, rng) if rng.uniform() < BRAKED else cls(spot, level, rounding)
+        rounding, creeps = draw_rounding(spot, level, rng), level / (BRAKING * spot.inertia)
+        brake = rng.uniform() < BRAKED and creeps <= ROUND[1] * spot.speed
+        return Brake.make(spot, amplitude, rng) if brake else cls(spot, level, rounding)
 
     def force(self, world: World, q: float, v: float) -> float:
         """The bristles', or that of a rounded sign."""
