@@ -82,6 +82,7 @@ def conceal(words: Sequence[str]) -> int:
             quantize=command.quantize,
             jitter=command.jitter,
             seed=command.seed,
+            say=lambda text: print(f"{text}."),
         )
     except ValueError as error:
         raise UsageError(str(error)) from error

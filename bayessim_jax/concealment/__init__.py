@@ -3,7 +3,7 @@
 from bayessim_jax.concealment.law import ModelLaw
 from bayessim_jax.concealment.motions import KINDS
 from bayessim_jax.concealment.registry import LAWS, UNKNOWN, choose_place, lookup_law
-from bayessim_jax.concealment.scene import Scene, make_scene
+from bayessim_jax.concealment.scene import Scene, StillError, make_scene
 from bayessim_jax.concealment.search import Hidden, StrengthError, hide
 from bayessim_jax.concealment.world import RunawayError, Track
 
@@ -15,6 +15,7 @@ __all__ = [
     "ModelLaw",
     "RunawayError",
     "Scene",
+    "StillError",
     "StrengthError",
     "Track",
     "choose_place",

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from bayessim_jax.concealment.law import Law
     from bayessim_jax.concealment.motions import Motion
 
-__all__ = ["Scene", "make_scene"]
+__all__ = ["Scene", "StillError", "make_scene"]
 
 SAMPLES = 4000
 """At most so many rows are looked at where forces are measured."""
@@ -32,6 +32,10 @@ LEAST = 1e-9
 """N or N m; a joint on which less acts is moved by nothing."""
 
 Forces = Float[np.ndarray, "samples nv"]
+
+
+class StillError(ValueError):
+    """A place that nothing moves."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +115,7 @@ class Scene:
         force = float(np.sqrt(np.mean(applied[:, v] ** 2)))
         if force < 1e-9 or speeds.max() < 1e-6:
             name = self.model.joint(joint).name
-            raise ValueError(f"joint/{name}: nothing moves it in these motions; choose another place or other motions.")
+            raise StillError(f"joint/{name}: nothing moves it in these motions; choose another place or other motions.")
         return {
             "force": force,
             "motors": float(np.sqrt(np.mean(motors[:, v] ** 2))),

@@ -9,19 +9,29 @@ import mujoco
 import numpy as np
 from scipy.optimize import least_squares
 
-from bayessim_jax.concealment import KINDS, ModelLaw, RunawayError, choose_place, hide, lookup_law, make_scene
+from bayessim_jax.concealment import (
+    KINDS,
+    ModelLaw,
+    RunawayError,
+    StillError,
+    choose_place,
+    hide,
+    lookup_law,
+    make_scene,
+)
 from bayessim_jax.recordings.augment import write_values
 from bayessim_jax.recordings.case import FILE, SCHEMA
 from bayessim_jax.recordings.files import to_json, write_text
 from bayessim_jax.recordings.layout import HINGE, SLIDE, Layout, layout_of_model
 from bayessim_jax.recordings.mjcf import compile_spec, read_spec
+from bayessim_jax.recordings.naming import with_names
 from bayessim_jax.recordings.paths import Target, find_target, nominal
 from bayessim_jax.recordings.starter import candidates, copy_model, label_target, parameter_text, toml_string
 from bayessim_jax.recordings.wording import CaseError
 from bayessim_jax.spelling import near_miss
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Callable, Collection, Sequence
     from pathlib import Path
 
     from bayessim_jax.concealment import Hidden, Scene, Track
@@ -34,6 +44,8 @@ NOISE = {HINGE: 1e-3, SLIDE: 2e-4}
 """Standard deviation of the noise of positions, rad and m; of velocities ten times as much for a second."""
 TRIES, FEW = 20, 400
 """Steps, at most, in which the parameters are sought that make up for most of what is concealed, and rows looked at."""
+DRAWS = 50
+"""Places that are drawn, at most, until one is found that something moves."""
 NOTHING = 0.01
 """Strength, below which what a model lacks is nothing."""
 MIDDLE = 0.7
@@ -70,6 +82,7 @@ def conceal(
     jitter: float = 0.0,
     horizon: float = 0.5,
     seed: int = 0,
+    say: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
     """Write a case in which effects are concealed (none: a clean one), and return what is sealed in it.
 
@@ -78,7 +91,8 @@ def conceal(
     model; by default the masses of what moves, or centres of mass where no motor drives anything), with values drawn
     from the middle of wide priors. A row is measured `rate` times a second (every other time step), with `noise` times
     1e-3 rad or 2e-4 m on positions, positions rounded to `quantize` counts for a turn or a metre, times scattered by
-    `jitter` times the distance of rows.
+    `jitter` times the distance of rows. What has no name in the model gets one in the case (`with_names`), which `say`
+    is told.
 
     Raises `ValueError` with one line for what cannot be done; then nothing is written.
     """
@@ -89,56 +103,58 @@ def conceal(
     _check(motions, recordings, seconds, horizon, noise, quantize, jitter, strengths)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise CaseError(str(folder), "is there already", "choose another folder, or remove it")
-    spec = read_spec(model, model.parent)
-    believed = compile_spec(spec.copy(), model)
-    layout = layout_of_model(believed)
-    _check_model(believed, layout, model)
-    stride = _stride(rate, float(believed.opt.timestep))
-    rng = np.random.default_rng(seed)
-    priors = _priors(believed, parameters)
-    truth = {
-        t: float(low + (high - low) * (0.5 + MIDDLE * rng.uniform(-0.5, 0.5))) for t, (low, high) in priors.items()
-    }
-    machine = _machine(spec, truth)
-    try:
-        scene = make_scene(
-            machine, rng, kind=motions, recordings=recordings, seconds=seconds, stride=stride, jitter=jitter
-        )
-        chosen = [choose_place(machine, name, place, rng) for name, place in zip(names, places, strict=True)]
-        hidden = [hide(scene, *one, seed) for one in zip(names, chosen, strengths, strict=True)]
-        _check_hidden(spec, machine, hidden, truth)
-        tracks = scene.play([h.law for h in hidden]) if hidden else scene.clean
-        lacks = _lacks(spec, priors, truth, scene, tracks) if hidden else {"with_truth": 0.0, "with_best": 0.0}
-    except RunawayError as error:
-        raise ValueError(f"{model.name}: {error}; choose other motions, or less strength.") from error
-    taken: set[str] = set()
-    labels = {target: label_target(target, taken) for target in priors}
-    sealed = {
-        "schema": SCHEMA,
-        "effects": [_describe(machine, h, asked) for h, asked in zip(hidden, strengths, strict=True)],
-        "lacks": lacks,
-        "parameters": {labels[target]: value for target, value in truth.items()},
-        "motions": motions,
-        "noise": noise,
-        "velocities": velocities,
-        "quantize": quantize,
-        "jitter": jitter,
-        "seed": seed,
-    }
-    file = copy_model(folder, model)
-    about = {"name": toml_string(folder.resolve().name), "model": toml_string(file)}
-    text = HEAD.format(sealed=SEALED, schema=SCHEMA, horizon=horizon, **about)
-    for target, (low, high) in priors.items():
-        text += "\n" + parameter_text(target, labels[target], low, high, believed, layout)
-    try:
-        for k, track in enumerate(tracks):
-            header, table = _measure(layout, track, rng, noise, velocities, quantize)
-            path = folder / "recordings" / f"run{k + 1:0{len(str(recordings))}d}.csv"
-            np.savetxt(path, table, delimiter=",", header=",".join(header), comments="", fmt="%.9g")
-        write_text(folder / SEALED, to_json(sealed, indent=2) + "\n")
-        write_text(folder / FILE, text)
-    except OSError as error:
-        raise CaseError(str(folder), f"cannot be written ({error.strerror})", "choose another folder") from error
+    with with_names(model, model.parent) as (model, told):
+        if told:
+            say(told)
+        spec = read_spec(model, model.parent)
+        believed = compile_spec(spec.copy(), model)
+        layout = layout_of_model(believed)
+        _check_model(believed, layout, model)
+        stride = _stride(rate, float(believed.opt.timestep))
+        rng = np.random.default_rng(seed)
+        priors = _priors(believed, parameters)
+        truth = {
+            t: float(low + (high - low) * (0.5 + MIDDLE * rng.uniform(-0.5, 0.5))) for t, (low, high) in priors.items()
+        }
+        machine = _machine(spec, truth)
+        try:
+            scene = make_scene(
+                machine, rng, kind=motions, recordings=recordings, seconds=seconds, stride=stride, jitter=jitter
+            )
+            hidden = [_hide(scene, *one, rng, seed) for one in zip(names, places, strengths, strict=True)]
+            _check_hidden(spec, machine, hidden, truth)
+            tracks = scene.play([h.law for h in hidden]) if hidden else scene.clean
+            lacks = _lacks(spec, priors, truth, scene, tracks) if hidden else {"with_truth": 0.0, "with_best": 0.0}
+        except RunawayError as error:
+            raise ValueError(f"{model.name}: {error}; choose other motions, or less strength.") from error
+        taken: set[str] = set()
+        labels = {target: label_target(target, taken) for target in priors}
+        sealed = {
+            "schema": SCHEMA,
+            "effects": [_describe(machine, h, asked) for h, asked in zip(hidden, strengths, strict=True)],
+            "lacks": lacks,
+            "parameters": {labels[target]: value for target, value in truth.items()},
+            "motions": motions,
+            "noise": noise,
+            "velocities": velocities,
+            "quantize": quantize,
+            "jitter": jitter,
+            "seed": seed,
+        }
+        file = copy_model(folder, model)
+        about = {"name": toml_string(folder.resolve().name), "model": toml_string(file)}
+        text = HEAD.format(sealed=SEALED, schema=SCHEMA, horizon=horizon, **about)
+        for target, (low, high) in priors.items():
+            text += "\n" + parameter_text(target, labels[target], low, high, believed, layout)
+        try:
+            for k, track in enumerate(tracks):
+                header, table = _measure(layout, track, rng, noise, velocities, quantize)
+                path = folder / "recordings" / f"run{k + 1:0{len(str(recordings))}d}.csv"
+                np.savetxt(path, table, delimiter=",", header=",".join(header), comments="", fmt="%.9g")
+            write_text(folder / SEALED, to_json(sealed, indent=2) + "\n")
+            write_text(folder / FILE, text)
+        except OSError as error:
+            raise CaseError(str(folder), f"cannot be written ({error.strerror})", "choose another folder") from error
     return sealed
 
 
@@ -203,6 +219,17 @@ def _priors(model: Any, parameters: Sequence[str] | None) -> dict[Target, tuple[
             told = near_miss(str(target), [str(t) for t in every])
             raise ValueError(f"parameter {str(target)!r}: it has no range to be drawn from; {told}")
     return {target: every[target] for target in chosen}
+
+
+def _hide(scene: Scene, name: str, place: str | None, strength: float, rng: np.random.Generator, seed: int) -> Hidden:
+    """An effect at a place, or at one that is drawn from those that something moves."""
+    for left in reversed(range(DRAWS)):
+        try:
+            return hide(scene, name, choose_place(scene.model, name, place, rng), strength, seed)
+        except StillError:
+            if place is not None or not left:
+                raise
+    raise AssertionError
 
 
 def _check_hidden(spec: Any, machine: Any, hidden: Sequence[Hidden], unknown: Collection[Target]) -> None:

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-__all__ = ["compile_spec", "import_mujoco", "read_spec", "referenced_files"]
+__all__ = ["compile_spec", "import_mujoco", "included_files", "read_spec", "referenced_files"]
 
 FOLDERS = {"mesh": "meshdir", "skin": "meshdir", "hfield": "meshdir", "flexcomp": "meshdir", "texture": "texturedir"}
 
@@ -59,6 +59,11 @@ def referenced_files(path: Path, root: Path) -> list[Path]:
             found.setdefault(place.resolve(), place)
         found = {file.resolve(): file for file in parts} | found
     return list(found.values())
+
+
+def included_files(path: Path, root: Path) -> list[Path]:
+    """An MJCF file and those that it includes, which are one model with it; raises as `referenced_files` does."""
+    return list(_parts(path, root))
 
 
 def _parts(path: Path, root: Path) -> dict[Path, ElementTree.Element]:

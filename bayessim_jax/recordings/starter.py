@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from bayessim_jax.recordings.case import FILE, NAME, SCHEMA
 from bayessim_jax.recordings.files import write_text
 from bayessim_jax.recordings.layout import FREE, HINGE, SLIDE, Layout, layout_of_model
 from bayessim_jax.recordings.mjcf import compile_spec, import_mujoco, read_spec, referenced_files
+from bayessim_jax.recordings.naming import with_names
 from bayessim_jax.recordings.paths import Target, element_names, nominal
 from bayessim_jax.recordings.wording import CaseError
 
@@ -47,14 +49,15 @@ def start_case(folder: Path, model: Path) -> tuple[Path, list[str]]:
     path = folder / FILE
     if path.exists():
         raise CaseError(str(path), "is there already", "choose another folder, or remove it")
-    root = folder if model.resolve().is_relative_to(folder.resolve()) else model.parent
-    compiled = compile_spec(read_spec(model, root), model)
-    layout = layout_of_model(compiled)
-    name = copy_model(folder, model)
-    _written(folder, lambda: write_text(path, case_text(folder.resolve().name, name, compiled, layout)))
-    return path, [
-        f"{name}: {element} has no name; name it, so that recordings can refer to it." for element in layout.unnamed
-    ]
+    inside = model.resolve().is_relative_to(folder.resolve())
+    with nullcontext((model, "")) if inside else with_names(model, model.parent) as (source, told):
+        compiled = compile_spec(read_spec(source, folder if inside else source.parent), source)
+        layout = layout_of_model(compiled)
+        name = copy_model(folder, source)
+        _written(folder, lambda: write_text(path, case_text(folder.resolve().name, name, compiled, layout)))
+    remarks = [told] if told else []
+    remarks += [f"{name}: {one} has no name; name it, so that recordings can refer to it" for one in layout.unnamed]
+    return path, [f"{remark}." for remark in remarks]
 
 
 def copy_model(folder: Path, model: Path) -> str:

@@ -172,7 +172,17 @@ def test_the_command_makes_a_case_and_tells_slips_in_one_line(tmp_path, model, c
     assert "is there already" in capsys.readouterr().err
     shutil.rmtree(tmp_path / "out")
     model.write_text("<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>")
-    assert run() == 2 and "has no name" in capsys.readouterr().err
+    assert run() == 2 and "has no hinge and no slide" in capsys.readouterr().err
+    hinges = "<body><joint name='still'/><geom size='1'/></body>" * 2
+    driven = hinges.replace("still", "driven", 1).replace("<body>", "<body pos='4 0 0'>", 1)
+    actuator = "<actuator><motor joint='driven' gear='100'/></actuator>"
+    model.write_text(f"<mujoco><option gravity='0 0 0'/><worldbody>{driven}</worldbody>{actuator}</mujoco>")
+    for seed in ("0", "1", "2"):
+        words = ("--effect", "viscous_friction", "--recordings", "2", "--seconds", "1.5", "--seed", seed)
+        assert run(*words) == 0, "a place that is drawn is one that moves"
+        assert "what had no name has one in the case: actuator/driven." in capsys.readouterr().out
+        assert json.loads((tmp_path / "out" / "sealed.json").read_text())["effects"][0]["at"] == "joint/driven"
+        shutil.rmtree(tmp_path / "out")
 
 
 def test_drawn_cases_hold_every_group_and_every_effect():

@@ -3,6 +3,7 @@
 import tomllib
 
 import mujoco
+import numpy as np
 import pytest
 
 from bayessim_jax.cli.main import main
@@ -114,8 +115,31 @@ def test_a_model_in_the_folder_stays_where_it_is(tmp_path):
     assert not (tmp_path / "case" / "arm.xml").exists()
 
 
-def test_elements_without_names_are_told(tmp_path, capsys):
-    model = write_arm(tmp_path / "robot", ARM.replace('name="rail" ', "").split("<actuator>")[0] + "</mujoco>")
+def test_elements_without_names_get_some_in_the_copy(tmp_path, capsys):
+    """After joints and bodies, apart from names that are taken; only tags without names change."""
+    text = ARM.replace('name="rail" ', "").replace('joint="rail"', 'joint="2nd joint"')
+    text = text.replace('name="servo" ', "").replace('name="motor" ', "").replace('name="imu" ', "")
+    text = text.replace("<worldbody>", '<include file="part.xml"/><worldbody>', 1).replace('body name="slider"', "body")
+    model = write_arm(tmp_path / "robot", text)
+    part = '<default><joint damping="0.1"/></default><sensor><jointpos joint="2nd joint"/></sensor>'
+    part = f"<mujocoinclude>{part}</mujocoinclude>"
+    (tmp_path / "robot" / "part.xml").write_text(part)
+    before = mujoco.MjModel.from_xml_path(str(model))
+    assert main(["new", str(tmp_path / "case"), "--model", str(model)]) == 0
+    told = capsys.readouterr().out
+    assert "arm.xml: what had no name has one in the case: " in told
+    after = mujoco.MjModel.from_xml_path(str(tmp_path / "case" / "arm.xml"))
+    names = [after.joint(i).name for i in range(after.njnt)], [after.actuator(i).name for i in range(after.nu)]
+    assert names == (["2nd joint", "joint", "cube"], ["2nd joint", "2nd joint_2"])
+    assert sorted(after.sensor(i).name for i in range(2)) == ["accelerometer_s", "jointpos_2nd joint"]
+    np.testing.assert_array_equal(after.jnt_axis, before.jnt_axis)
+    np.testing.assert_array_equal(after.actuator_gear, before.actuator_gear)
+    assert "<freejoint name=" in (tmp_path / "case" / "arm.xml").read_text()
+    assert (tmp_path / "robot" / "part.xml").read_text() == part
+
+
+def test_elements_without_names_are_told_where_the_model_is_in_the_case(tmp_path, capsys):
+    model = write_arm(tmp_path / "case", ARM.replace('name="rail" ', "").split("<actuator>")[0] + "</mujoco>")
     assert main(["new", str(tmp_path / "case"), "--model", str(model)]) == 0
     assert "joint 1 (of body slider) has no name" in capsys.readouterr().out
 
