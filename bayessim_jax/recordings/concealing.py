@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -23,8 +24,7 @@ from bayessim_jax.recordings.augment import write_values
 from bayessim_jax.recordings.case import FILE, SCHEMA
 from bayessim_jax.recordings.files import to_json, write_text
 from bayessim_jax.recordings.layout import HINGE, SLIDE, Layout, layout_of_model
-from bayessim_jax.recordings.mjcf import compile_spec, read_spec
-from bayessim_jax.recordings.naming import with_names
+from bayessim_jax.recordings.naming import read_named
 from bayessim_jax.recordings.paths import Target, find_target, nominal
 from bayessim_jax.recordings.starter import candidates, copy_model, label_target, parameter_text, toml_string
 from bayessim_jax.recordings.wording import CaseError
@@ -91,7 +91,7 @@ def conceal(
     model; by default the masses of what moves, or centres of mass where no motor drives anything), with values drawn
     from the middle of wide priors. A row is measured `rate` times a second (every other time step), with `noise` times
     1e-3 rad or 2e-4 m on positions, positions rounded to `quantize` counts for a turn or a metre, times scattered by
-    `jitter` times the distance of rows. What has no name in the model gets one in the case (`with_names`), which `say`
+    `jitter` times the distance of rows. What has no name in the model gets one in the case (`read_named`), which `say`
     is told.
 
     Raises `ValueError` with one line for what cannot be done; then nothing is written.
@@ -103,11 +103,9 @@ def conceal(
     _check(motions, recordings, seconds, horizon, noise, quantize, jitter, strengths)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise CaseError(str(folder), "is there already", "choose another folder, or remove it")
-    with with_names(model, model.parent) as (model, told):
+    with read_named(model, model.parent) as (model, spec, believed, told):
         if told:
             say(told)
-        spec = read_spec(model, model.parent)
-        believed = compile_spec(spec.copy(), model)
         layout = layout_of_model(believed)
         _check_model(believed, layout, model)
         stride = _stride(rate, float(believed.opt.timestep))
@@ -223,13 +221,11 @@ def _priors(model: Any, parameters: Sequence[str] | None) -> dict[Target, tuple[
 
 def _hide(scene: Scene, name: str, place: str | None, strength: float, rng: np.random.Generator, seed: int) -> Hidden:
     """An effect at a place, or at one that is drawn from those that something moves."""
-    for left in reversed(range(DRAWS)):
-        try:
-            return hide(scene, name, choose_place(scene.model, name, place, rng), strength, seed)
-        except StillError:
-            if place is not None or not left:
-                raise
-    raise AssertionError
+    draw = lambda: hide(scene, name, choose_place(scene.model, name, place, rng), strength, seed)  # noqa: E731
+    for _ in range(DRAWS - 1 if place is None else 0):
+        with suppress(StillError):
+            return draw()
+    return draw()
 
 
 def _check_hidden(spec: Any, machine: Any, hidden: Sequence[Hidden], unknown: Collection[Target]) -> None:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import shutil
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
@@ -18,7 +18,7 @@ from bayessim_jax.recordings.wording import CaseError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["with_names"]
+__all__ = ["read_named"]
 
 KINDS = {"actuator": "actuator", "sensor": "sensor", "body": "joint", "frame": "joint"}
 """What stands in an element of MJCF that recordings refer to."""
@@ -26,38 +26,49 @@ OBJECTS = ("joint", "jointinparent", "tendon", "site", "body", "geom", "actuator
 """What an actuator or a sensor may be of."""
 
 
-@contextmanager
-def with_names(model: Path, root: Path) -> Iterator[tuple[Path, str]]:
-    """A model all of whose joints, actuators and sensors have names, and what was named, in words.
+class Read(NamedTuple):
+    """An MJCF file, its `mujoco.MjSpec` and its `mujoco.MjModel`, and what was named in it, in words."""
 
-    That is the model itself where nothing lacks a name; else a copy for as long as the context lasts, with what the
-    model refers to. An actuator is named after its joint or whatever it acts on, a sensor after what it is of, a joint
-    after its body, with a number where that is taken. Elements that have no text of their own, such as those of a
-    `replicate`, stay as they are.
+    path: Path
+    spec: Any
+    model: Any
+    told: str = ""
+
+
+@contextmanager
+def read_named(path: Path, root: Path, rename: bool = True) -> Iterator[Read]:
+    """A model all of whose joints, actuators and sensors have names.
+
+    That is the model itself where nothing lacks a name, or it is not to `rename`; else a copy for as long as the
+    context lasts, with what the model refers to. An actuator is named after its joint or whatever it acts on, a sensor
+    after what it is of, a joint after its body, with a number where that is taken. Elements that have no text of their
+    own, such as those of a `replicate`, stay as they are. Raises `CaseError` as `read_spec` and `compile_spec` do.
     """
-    compiled = compile_spec(read_spec(model, root), model)
-    if not layout_of_model(compiled).unnamed:
-        yield model, ""
+    read = _read(path, root)
+    if not rename or not layout_of_model(read.model).unnamed:
+        yield read
         return
-    taken = {kind: set(element_names(compiled, kind)) for kind in set(KINDS.values())}
+    taken = {kind: set(element_names(read.model, kind)) for kind in set(KINDS.values())}
     with TemporaryDirectory() as folder:
         there = lambda file: Path(folder) / file.resolve().relative_to(root.resolve())  # noqa: E731
-        for source in referenced_files(model, root):
+        for source in referenced_files(path, root):
             there(source).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, there(source))
         given: list[str] = []
-        for source in included_files(model, root):
+        for source in included_files(path, root):
             text, names = _name(source.read_bytes(), taken)
             there(source).write_bytes(text)
             given += names
-        named = there(model)
-        try:
-            compile_spec(read_spec(named, Path(folder)), named)
-        except CaseError:
-            yield model, ""
-            return
         listed = ", ".join(given)
-        yield named, f"{model.name}: what had no name has one in the case: {listed}" if given else ""
+        told = f"{path.name}: what had no name has one in the case: {listed}" if given else ""
+        with suppress(CaseError):  # names that do not go together with those that MuJoCo makes
+            read = _read(there(path), Path(folder))._replace(told=told)
+        yield read
+
+
+def _read(path: Path, root: Path) -> Read:
+    spec = read_spec(path, root)
+    return Read(path, spec, compile_spec(spec, path))
 
 
 def _name(text: bytes, taken: dict[str, set[str]]) -> tuple[bytes, list[str]]:

@@ -17,7 +17,6 @@ from jaxtyping import Bool, Float, Int
 
 from bayessim_jax.beliefs.margins import Margin, Margins, log_normal, normal, uniform
 from bayessim_jax.contracts import Box
-from bayessim_jax.engines.tree import find_refusals
 from bayessim_jax.inference.replay import Inputs, Replay, Restarted
 from bayessim_jax.inference.scores import predict_windows
 from bayessim_jax.inference.shooting import Predict, Shots
@@ -26,7 +25,7 @@ from bayessim_jax.recordings.priors import LogNormal, Normal, Prior
 from bayessim_jax.recordings.recording import CaseRecording, resample
 from bayessim_jax.recordings.smoothing import smooth_recordings
 from bayessim_jax.recordings.splitting import choose_held_out, describe_inputs
-from bayessim_jax.recordings.unreached import drop_contacts, drop_limits
+from bayessim_jax.recordings.unreached import drop_unreached
 from bayessim_jax.recordings.windows import Windows, stack_windows
 from bayessim_jax.systems.mjcf import MjcfSystem, Unknown, mjcf_system
 
@@ -332,11 +331,7 @@ def case_model(
     }
     channels = tuple(c for c in (*layout.qpos, *layout.qvel, *layout.sensors) if c in measured)
     if engine in ("auto", "tree") and not whole:
-        if drop_contacts(spec, case.recordings):
-            remarks.append("contacts are left out: nothing touches in the recordings")
-        if not find_refusals(spec.compile()) and (count := drop_limits(spec, case.recordings)):
-            what = "limits of one joint" if count == 1 else f"limits of {count} joints"
-            remarks.append(f"{what} are left out: the recordings do not come near")
+        remarks += drop_unreached(spec, case.recordings)
     unknowns = [Unknown(p.name, tuple(str(t) for t in p.targets), *_bounds(p.prior), p.unit) for p in case.parameters]
     system = mjcf_system(spec, unknowns, observe=channels, substeps=substeps, engine=engine)
     return CaseModel(case, system, margins_of(case), tuple(recordings), channels, tuple(remarks), before, refined)

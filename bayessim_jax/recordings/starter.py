@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shutil
-from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,8 +11,8 @@ import numpy as np
 from bayessim_jax.recordings.case import FILE, NAME, SCHEMA
 from bayessim_jax.recordings.files import write_text
 from bayessim_jax.recordings.layout import FREE, HINGE, SLIDE, Layout, layout_of_model
-from bayessim_jax.recordings.mjcf import compile_spec, import_mujoco, read_spec, referenced_files
-from bayessim_jax.recordings.naming import with_names
+from bayessim_jax.recordings.mjcf import import_mujoco, referenced_files
+from bayessim_jax.recordings.naming import read_named
 from bayessim_jax.recordings.paths import Target, element_names, nominal
 from bayessim_jax.recordings.wording import CaseError
 
@@ -50,8 +49,7 @@ def start_case(folder: Path, model: Path) -> tuple[Path, list[str]]:
     if path.exists():
         raise CaseError(str(path), "is there already", "choose another folder, or remove it")
     inside = model.resolve().is_relative_to(folder.resolve())
-    with nullcontext((model, "")) if inside else with_names(model, model.parent) as (source, told):
-        compiled = compile_spec(read_spec(source, folder if inside else source.parent), source)
+    with read_named(model, folder if inside else model.parent, rename=not inside) as (source, _, compiled, told):
         layout = layout_of_model(compiled)
         name = copy_model(folder, source)
         _written(folder, lambda: write_text(path, case_text(folder.resolve().name, name, compiled, layout)))

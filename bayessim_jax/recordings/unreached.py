@@ -17,7 +17,7 @@ from bayessim_jax.engines.tree import find_refusals
 from bayessim_jax.recordings.layout import HINGE, SLIDE
 from bayessim_jax.recordings.recording import CaseRecording
 
-__all__ = ["drop_contacts", "drop_limits"]
+__all__ = ["drop_unreached"]
 
 ROWS = 200
 """Rows of a recording that are looked at, spread evenly."""
@@ -27,22 +27,26 @@ SHARE = 0.1
 """Of what a distance, between two geoms or to a limit, changes by: what counts as near is smaller than that."""
 
 
-def drop_contacts(spec: mujoco.MjSpec, recordings: Sequence[CaseRecording]) -> bool:
-    """Disable contacts where they alone keep the tree engine from a model and none is made; says whether it did."""
+def drop_unreached(spec: mujoco.MjSpec, recordings: Sequence[CaseRecording]) -> list[str]:
+    """Disable contacts, where they alone keep the tree engine from a model and none is made, and limits; says which."""
     model, flag = spec.compile(), int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-    if not find_refusals(model):
-        return False
-    without = copy.copy(model)
-    without.opt.disableflags |= flag
-    if find_refusals(without) or _touches(model, recordings):
-        return False
-    spec.option.disableflags |= flag
-    return True
+    remarks: list[str] = []
+    if find_refusals(model):
+        without = copy.copy(model)
+        without.opt.disableflags |= flag
+        if find_refusals(without) or _touches(model, recordings):
+            return []
+        spec.option.disableflags |= flag
+        remarks.append("contacts are left out: nothing touches in the recordings")
+    if count := _drop_limits(spec, model, recordings):
+        what = "limits of one joint" if count == 1 else f"limits of {count} joints"
+        remarks.append(f"{what} are left out: the recordings do not come near")
+    return remarks
 
 
-def drop_limits(spec: mujoco.MjSpec, recordings: Sequence[CaseRecording]) -> int:
+def _drop_limits(spec: mujoco.MjSpec, model: mujoco.MjModel, recordings: Sequence[CaseRecording]) -> int:
     """Disable the limits of hinges and slides that are measured and stay away from them; says of how many joints."""
-    model, count = spec.compile(), 0
+    count = 0
     for joint in spec.joints:
         single = model.jnt_type[joint.id] in (SLIDE, HINGE)
         if single and model.jnt_limited[joint.id] and _stays_away(model, joint.id, recordings):

@@ -1,4 +1,4 @@
-"""Contacts that no recording makes are left out, and others are not."""
+"""Contacts and limits that no recording reaches are left out, and others are not."""
 
 import pytest
 
