@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Scalar
+from jaxtyping import Array, Bool, Float
 
 from bayessim_jax.beliefs.margins import Margin, Margins, log_uniform, uniform, values_between
 from bayessim_jax.effects import EffectParameter, Scales, at, with_effects
@@ -274,13 +274,17 @@ class Bench:
         sigma: Float[Array, " obs"],
         *,
         steps: int = 20,
-        damping: float | Scalar = DAMPING,
+        damping: float = DAMPING,
+        known: Fit | None = None,
     ) -> Fit:
-        """Fit a candidate from a point; what δ does not say of initial states is as it is taken to be."""
+        """Fit a candidate from a point; what δ does not say of initial states is as it is taken to be.
+
+        `known` is its fit to the same windows that ended there.
+        """
         own = self.setup(candidate)
         delta = jnp.pad(delta, ((0, 0), (0, own.spread.size - delta.shape[-1])))
         start, how = (x, delta, sigma, self.free(candidate)), {"steps": steps, "step": self.step, "damping": damping}
-        return solve(self.simulator(candidate), own, *start, **how, live=self.used(candidate))
+        return solve(self.simulator(candidate), own, *start, **how, live=self.used(candidate), known=known)
 
     def traded(self, candidate: Candidate, x: Float[Array, " k"]) -> list[Float[Array, " k"]]:
         """Points at which one of a candidate's effects has other numbers that do much the same."""

@@ -140,7 +140,8 @@ class _Work:
         for _ in range(ROUNDS):
             sigma = estimate_noise(self.bench.shots, fit, self.floor, free, LEAST_SHARE)
             change = np.abs(np.log(np.asarray(sigma) / np.asarray(fit.sigma))).max()
-            fit = self.bench.fit(candidate, fit.z, fit.delta, sigma, steps=STEPS, damping=fit.damping)
+            how = {"steps": STEPS, "damping": fit.damping, "known": fit}
+            fit = self.bench.fit(candidate, fit.z, fit.delta, sigma, **how)
             if change < 0.03:
                 break
         return fit

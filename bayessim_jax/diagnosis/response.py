@@ -22,8 +22,8 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from bayessim_jax.contracts import Scalar
-from bayessim_jax.inference.shooting import COMPILER_OPTIONS, FEW_CALLS, Curvature, eliminate, stride
+from bayessim_jax.inference.arrow import Curvature
+from bayessim_jax.inference.shooting import COMPILER_OPTIONS, FEW_CALLS
 from bayessim_jax.programs import trace_once
 from bayessim_jax.systems.mjcf import displace
 
@@ -45,13 +45,10 @@ __all__ = [
     "find_gaps",
     "find_heavier",
     "move_steps",
-    "propose",
     "respond",
     "weigh",
 ]
 
-LONGEST = 1.0
-"""The longest step of p, but for steps back from an end."""
 EASY = 1e-6
 """Precision of forces that may be any, to what they move on average."""
 Numbers = Array | np.ndarray
@@ -352,7 +349,7 @@ def _foresee(
     return r, jnp.moveaxis((own * weight[..., None]).reshape(count, -1, e), 1, 2), rest
 
 
-@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
+@trace_once(compiler_options=COMPILER_OPTIONS, to_numpy=True)
 def assess(
     lin: Linearized,
     rest: Rest,
@@ -381,16 +378,16 @@ def assess(
     )
     pulls = jnp.concatenate([pull[:, :d], along_own[..., -1], jnp.zeros((windows, room))], 1)
     cross = [rest.products[:, d:, :d], beside[:, d:], jnp.zeros((windows, n, room))]
-    curvature = Curvature(
-        cost=0.5 * ((r**2).sum() + p @ p + (scaled**2).sum()),
-        hessian=jnp.pad(hessian.sum(0), (0, room)) + jnp.eye(p.size),
-        gradient=pulls.sum(0) - p,
-        own=rest.products[:, d:, d:] + jnp.eye(n),
-        cross=jnp.concatenate(cross, -1),
-        own_gradient=pull[:, d:] - scaled,
-        pulls=pulls,
-    )
-    return curvature, r.reshape(windowed.y.shape)
+    equations: dict[str, Any] = {
+        "cost": 0.5 * ((r**2).sum() + p @ p + (scaled**2).sum()),
+        "hessian": jnp.pad(hessian.sum(0), (0, room)) + jnp.eye(p.size),
+        "gradient": pulls.sum(0) - p,
+        "own": rest.products[:, d:, d:] + jnp.eye(n),
+        "cross": jnp.concatenate(cross, -1),
+        "own_gradient": pull[:, d:] - scaled,
+        "pulls": pulls,
+    }
+    return Curvature(**equations), r.reshape(windowed.y.shape)
 
 
 @partial(jax.jit, compiler_options=COMPILER_OPTIONS)
@@ -461,29 +458,6 @@ def bound_gains(
 
     still = gain(rest.slopes[:, d:], jnp.ones(n), states)
     return jax.lax.map(under, jnp.moveaxis(pushed, 2, 0)) - still
-
-
-@trace_once(compiler_options=COMPILER_OPTIONS, to_numpy=True)
-def propose(
-    curvature: Curvature,
-    damping: Scalar,
-    free: Bool[Array, " k"],
-    bounded: Bool[Array, " k"],
-    spread: Float[Array, " n"],
-    p: Float[Array, " k"],
-    delta: Float[Array, "windows n"],
-) -> tuple[Float[Array, " k"], Float[Array, "windows n"], Scalar]:
-    """Where a Levenberg-Marquardt step leads from (p, initial states), and the cost there were residuals linear."""
-    precision, gradient, toward, shift = eliminate(curvature, damping)
-    held = jnp.outer(free, free)
-    precision = jnp.where(held, precision, jnp.eye(len(free))) + damping * jnp.diag(jnp.diagonal(curvature.hessian))
-    move = jnp.linalg.solve(precision, jnp.where(free, gradient, 0.0))
-    to, move = stride(p, move, bounded, LONGEST)
-    states = shift - toward @ move
-    pushed = move @ curvature.hessian @ move + jnp.einsum("wi,wij,wj->", states, curvature.own, states)
-    fall = curvature.gradient @ move + (curvature.own_gradient * states).sum()
-    cost = curvature.cost - fall + 0.5 * pushed + jnp.einsum("wi,wij,j->", states, curvature.cross, move)
-    return to, delta + states * spread, cost
 
 
 @trace_once(compiler_options=FEW_CALLS, to_numpy=True)

@@ -48,7 +48,8 @@ from bayessim_jax.effects.places import find_site, has_rate
 from bayessim_jax.effects.wiring import Wired, edit_model
 from bayessim_jax.engines.contract import Engine
 from bayessim_jax.engines.fields import Write
-from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Curvature, Shots
+from bayessim_jax.inference.arrow import Curvature
+from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Shots
 from bayessim_jax.systems.mjcf import MjcfSystem, displace
 
 __all__ = ["Scene"]

@@ -21,11 +21,11 @@ from scipy.special import ndtri
 
 from bayessim_jax.beliefs.margins import Margin
 from bayessim_jax.diagnosis.bench import NEAR, Candidate, begin_point, bounded_numbers, traded
-from bayessim_jax.diagnosis.response import propose
 from bayessim_jax.diagnosis.scene import Scene
 from bayessim_jax.diagnosis.simulated_scene import SimulatedScene
 from bayessim_jax.diagnosis.whiteness import Misfit, judge_misfit
 from bayessim_jax.effects import EffectParameter
+from bayessim_jax.inference.arrow import propose
 from bayessim_jax.inference.direct import noise_floor, noise_level
 from bayessim_jax.inference.shooting import in_units
 
@@ -33,6 +33,8 @@ __all__ = ["Begun", "March", "Screen", "Screened"]
 
 ITERATIONS, AGAIN = 6, 3
 """Steps of the solver with the noise of before, and then with its own."""
+LONGEST = 1.0
+"""The longest step of p, but for steps back from an end."""
 INERTIAS, BAD = ("kg", "kg m²"), 1.5
 """Units of parameters for which θ gives way first, where an effect begins at so many times the cost without it."""
 FALLING = 6
@@ -65,7 +67,7 @@ EDGE = 0.02
 class March:
     """Where Levenberg and Marquardt's method stands: the point that is tried next, and the best one so far."""
 
-    tried: tuple[Any, Array]
+    tried: tuple[Any, Any]
     here: tuple[Any, ...] = ()
     """(p, δ, curvature, residuals)."""
     damping: float = 1e-3
@@ -128,6 +130,7 @@ class Screen:
         self.pairs, self.name, self.takes, self.offsets = scene.pairs, scene.name, scene.takes, scene.offsets
         self.floor = noise_floor(scene.shots)
         self.bounded = bounded_numbers(scene.margins, scene.slots)
+        self.spread = np.asarray(scene.shots.spread)
         self.counts = np.maximum(np.asarray(scene.shots.measured).sum((0, 1)), 1)
 
     def twin(self) -> Screen:
@@ -213,9 +216,10 @@ class Screen:
                 march.damping *= 10
             if march.steps < iterations:
                 moving = system if march.steps == 1 and cost > bad else free
-                at_work = march.here[2], march.damping, moving, self.bounded, self.shots.spread, *march.here[:2]
-                p, delta, promised = propose(*at_work)
-                march.tried, march.promised = (p, delta), float(np.nan_to_num(promised, nan=np.inf))
+                p, delta, curvature = np.asarray(march.here[0]), np.asarray(march.here[1]), march.here[2]
+                how = (march.damping, moving, self.bounded, self.spread)
+                p, delta, fall = propose(curvature, *how, p, delta, LONGEST)
+                march.tried, march.promised = (p, delta), float(np.nan_to_num(march.cost - fall, nan=np.inf))
 
     def settle(
         self,

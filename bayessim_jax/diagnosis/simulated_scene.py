@@ -21,8 +21,9 @@ from bayessim_jax.beliefs.margins import Margin, values_between
 from bayessim_jax.diagnosis.bench import Bench, Candidate, CandidatesOf
 from bayessim_jax.effects import with_effects
 from bayessim_jax.effects.commanded import EVERY
+from bayessim_jax.inference.arrow import Curvature, normal_equations
 from bayessim_jax.inference.replay import Inputs, replay_window
-from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Curvature, Shots, expand, normal_equations
+from bayessim_jax.inference.shooting import COMPILER_OPTIONS, Shots, expand
 
 __all__ = ["SimulatedScene"]
 
@@ -79,22 +80,20 @@ class SimulatedScene(CandidatesOf):
 
     def assess(
         self, candidate: Candidate, p: Float[np.ndarray, " k"], delta: Float[Array, "windows n"], sigma: Array
-    ) -> tuple[Curvature, Float[Array, "windows rows obs"]]:
+    ) -> tuple[Curvature, Float[np.ndarray, "windows rows obs"]]:
         """Normal equations at a point, and residuals over σ."""
-        return self._expand(candidate, p, delta, sigma)[:2]
+        r, slopes = self.expand(candidate, p, delta, sigma)
+        scaled = np.asarray(delta) / np.asarray(self.shots.spread)
+        return normal_equations(r.reshape(len(r), -1), slopes, np.asarray(p), scaled), r
 
     def expand(
         self, candidate: Candidate, p: Float[np.ndarray, " k"], delta: Float[Array, "windows n"], sigma: Array
-    ) -> tuple[Float[Array, "windows rows obs"], Float[Array, "windows kn rowsobs"]]:
+    ) -> tuple[Float[np.ndarray, "windows rows obs"], Float[np.ndarray, "windows kn rowsobs"]]:
         """Residuals over σ at a point, and derivatives of what is predicted over σ."""
-        return self._expand(candidate, p, delta, sigma)[1:]
-
-    def _expand(
-        self, candidate: Candidate, p: np.ndarray, delta: Array, sigma: Array
-    ) -> tuple[Curvature, Array, Array]:
         if candidate not in self._shots:
             self._shots[candidate] = self.setup(candidate)
-        return _assess(self.predict, self._shots[candidate], jnp.asarray(p), delta, sigma)
+        r, slopes = map(np.asarray, _expand(self.predict, self._shots[candidate], jnp.asarray(p), delta, sigma))
+        return r.reshape(self.shots.y.shape), slopes
 
     def setup(self, candidate: Candidate) -> Shots:
         """The windows with a candidate's parameters free."""
@@ -141,9 +140,4 @@ def _predict_chosen(bench: Bench) -> Any:
     return predict
 
 
-def _assess_impl(predict: Any, shots: Shots, p: Array, delta: Array, sigma: Array) -> tuple[Curvature, Array, Array]:
-    r, slopes = expand(predict, shots, p, delta, sigma)
-    return normal_equations(r, slopes, p, delta / shots.spread), r.reshape(shots.y.shape), slopes
-
-
-_assess = jax.jit(_assess_impl, static_argnames="predict", compiler_options=COMPILER_OPTIONS)
+_expand = jax.jit(expand, static_argnames="predict", compiler_options=COMPILER_OPTIONS)

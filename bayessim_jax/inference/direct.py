@@ -106,16 +106,18 @@ def fit_direct(
     starts: int = STARTS,
     steps: int = 40,
     step: float = 0.0,
+    tolerance: float | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Fit:
     """Fit z, every window's initial state, and the noise of every channel, from several points of the prior.
 
-    With `start` only that point is begun from, with its noise.
+    With `start` only that point is begun from, with its noise. `step` and `tolerance` are the solver's.
     """
     windows, n = shots.y.shape[0], shots.spread.size
     floor = noise_floor(shots)
     free = np.ones(d, bool)
-    run = lambda z, delta, sigma, count: solve(predict, shots, z, delta, sigma, free, steps=count, step=step)  # noqa: E731
+    fixed = {"step": step, "tolerance": tolerance}
+    run = lambda z, delta, sigma, **how: solve(predict, shots, z, delta, sigma, free, **fixed, **how)  # noqa: E731
     if start is None:
         spread = _spreads(shots)
         sigma = jnp.asarray(np.maximum(0.05 * spread, np.asarray(floor)))
@@ -126,7 +128,7 @@ def fit_direct(
         order = np.argsort(np.where(np.isfinite(costs), costs, np.inf))
         chosen = [0, *[int(i) for i in order if i != 0 and np.isfinite(costs[i])][: starts if d else 0]]
         say(f"{len(chosen)} starts, the best of {SCREENED} draws of the prior")
-        fits = [run(points[i], delta, sigma, 15) for i in chosen]
+        fits = [run(points[i], delta, sigma, steps=15) for i in chosen]
         finite = [fit for fit in fits if np.isfinite(float(fit.cost))]
         if not finite:
             raise ValueError(
@@ -134,11 +136,11 @@ def fit_direct(
             )
         best = min(finite, key=lambda fit: float(fit.cost))
     else:
-        best = run(start.z, start.delta, start.sigma, steps)
+        best = run(start.z, start.delta, start.sigma, steps=steps)
     for _ in range(ROUNDS):
         sigma = estimate_noise(shots, best, floor)
         change = float(np.abs(np.log(np.asarray(sigma) / np.asarray(best.sigma))).max())
-        best = run(best.z, best.delta, sigma, steps)
+        best = run(best.z, best.delta, sigma, steps=steps, known=best)
         if change < 0.02:
             break
     return best

@@ -16,32 +16,30 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax.scipy.special import ndtr, ndtri
-from jax.scipy.stats import norm
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from bayessim_jax.contracts import Scalar
 from bayessim_jax.engines.batch import TASKS, WIDE
+from bayessim_jax.inference.arrow import Curvature, eliminate, normal_equations, own_pulls, propose, within_reach
 from bayessim_jax.programs import trace_once
 
 __all__ = [
     "COMPILER_OPTIONS",
     "FEW_CALLS",
+    "ROUGH",
     "absorb",
-    "Curvature",
     "Fit",
     "Predict",
     "Shots",
     "expand",
     "in_units",
-    "normal_equations",
     "predict_all",
     "Ridge",
     "profile",
@@ -49,7 +47,6 @@ __all__ = [
     "ridge",
     "robust_covariance",
     "solve",
-    "stride",
 ]
 
 Predict = Callable[[Float[Array, " d"], Float[Array, " n"], Any], Float[Array, "rows obs"]]
@@ -59,8 +56,14 @@ Predict = Callable[[Float[Array, " d"], Float[Array, " n"], Any], Float[Array, "
 TOLERANCE, ROUGH, DAMPING = 1e-7, 1e-4, 1e-3
 """Of the solver: the share of the cost that it ends with, where simulators are smooth and where not, and the damping
 that it begins with."""
-LONGEST, OUTERMOST = 2.0, 1e-4
-"""The longest step of z, and the share of an interval at either end into which no step from the other one leads."""
+SETTLED = 1e-3
+"""By how much the cost may still fall where the last step, a twentieth of a standard deviation, is not simulated."""
+LEAST, STUCK = 1e-9, 1e9
+"""Damping at least, and so much that no step helps."""
+TOGETHER = 28
+"""Windows that a processor simulates at a time at least: a point alone costs its share, and vectors are full."""
+LONGEST = 2.0
+"""The longest step of z."""
 
 
 @struct.dataclass
@@ -85,25 +88,8 @@ class Shots:
 
 
 @struct.dataclass
-class Curvature:
-    """The normal equations of all windows at one point, the initial states eliminated one by one."""
-
-    cost: Scalar
-    """½ (Σ residuals² + zᵀz + Σ δᵀS⁻²δ)."""
-    hessian: Float[Array, "d d"]
-    """Of z, with z's prior."""
-    gradient: Float[Array, " d"]
-    own: Float[Array, "windows n n"]
-    """Of every δ_w, with its prior."""
-    cross: Float[Array, "windows n d"]
-    own_gradient: Float[Array, "windows n"]
-    pulls: Float[Array, "windows d"]
-    """Every window's part of the gradient of z."""
-
-
-@struct.dataclass
 class Fit:
-    """Where the solver ended."""
+    """Where the solver ended, in NumPy's numbers."""
 
     z: Float[Array, " d"]
     delta: Float[Array, "windows n"]
@@ -118,9 +104,9 @@ class Fit:
     slopes: Float[Array, "windows dn k"]
     """Derivatives of predictions / σ along (z, δ/S)."""
     cost: Scalar
-    steps: Int[Array, ""]
-    converged: Bool[Array, ""]
-    damping: Scalar | float = DAMPING
+    steps: int
+    converged: bool
+    damping: float = DAMPING
     """Of the solver's last step."""
 
     @property
@@ -139,10 +125,10 @@ class Fit:
         along = np.linalg.solve(precision[d:, d:], precision[d:, :d])
         return dataclasses.replace(
             self,
-            z=jax.device_put(np.asarray(self.z)[:d]),
-            precision=jax.device_put(precision[:d, :d] - precision[:d, d:] @ along),
-            pulls=jax.device_put(pulls[:, :d] - pulls[:, d:] @ along),
-            slopes=jax.device_put(np.delete(slopes, np.s_[d : len(precision)], axis=1)),
+            z=np.asarray(self.z)[:d],
+            precision=precision[:d, :d] - precision[:d, d:] @ along,
+            pulls=pulls[:, :d] - pulls[:, d:] @ along,
+            slopes=np.delete(slopes, np.s_[d : len(precision)], axis=1),
         )
 
     @property
@@ -167,26 +153,43 @@ def predict_all(predict: Predict, shots: Shots, z: Array, delta: Array) -> Float
 
 
 def expand(
-    predict: Predict, shots: Shots, z: Array, delta: Array, sigma: Array, step: float = 0.0, live: int | None = None
+    predict: Predict,
+    shots: Shots,
+    z: Array,
+    delta: Array,
+    sigma: Array,
+    step: float = 0.0,
+    live: int | None = None,
+    alone: Bool[Array, ""] | bool = False,
 ) -> tuple[Float[Array, "windows k"], Float[Array, "windows dn k"]]:
     """Residuals of every window and the derivatives of its predictions along (z, δ/S), both in units of σ.
 
     Differences of length ε^⅓, with ε what numbers of this kind resolve: central ones along z, where a ridge must not
     look informed, and forward ones along δ, which move far less than a simulator bends. Where it is not smooth all are
-    central, of length `step`. They and the point itself are one batch of simulations: the compiler meets a simulator
+    central, of length `step`. The point and those beside it are simulated by one loop: the compiler meets a simulator
     once, where forward-mode derivatives of it make a program several times as large (`docs/architecture.md`). Of z
-    only the first `live` matter to the simulator, all unless told.
+    only the first `live` matter to the simulator, all unless told. With the point `alone` only the residuals are right.
     """
     d, n, windows = z.size if live is None else live, delta.shape[-1], delta.shape[0]
     still = jnp.zeros(z.size - d, z.dtype)
     length = step or float(jnp.finfo(z.dtype).eps) ** (1 / 3)
     both = d + n if step else d
-    ways = length * jnp.concatenate([jnp.zeros((1, d + n)), jnp.eye(d + n), -jnp.eye(both, d + n)])
+    count = 1 + d + n + both
+    together = min(-(-TOGETHER // windows), count) if jax.default_backend() == "cpu" else count
+    runs = -(-count // together)
+    ways = jnp.concatenate([jnp.zeros((1, d + n)), jnp.eye(d + n), -jnp.eye(both, d + n)])
+    ways = length * jnp.pad(ways, ((0, runs * together - count), (0, 0)))
     # points outside and windows inside: z is common to all windows, and theirs lie side by side
     moved = lambda way: z + jnp.concatenate([way[:d], still])  # noqa: E731
     run = lambda way: predict_all(predict, shots, moved(way), delta + way[d:] * shots.spread)  # noqa: E731
-    y = jax.vmap(run)(ways)
-    value, ahead, behind = y[0], y[1 : 1 + d + n], y[1 + d + n :]
+
+    def go_on(k: Array, y: Array) -> Array:
+        some = jax.lax.dynamic_slice_in_dim(ways, k * together, together)
+        return jax.lax.dynamic_update_slice_in_dim(y, jax.vmap(run)(some), k * together, 0)
+
+    y = jnp.zeros((runs * together, *shots.y.shape), jnp.result_type(z, shots.y))
+    y = jax.lax.fori_loop(0, jnp.where(alone, 1, runs) if isinstance(alone, Array) else runs, go_on, y)
+    value, ahead, behind = y[0], y[1 : 1 + d + n], y[1 + d + n : count]
     slopes = [(ahead[:both] - behind) / (2 * length), (ahead[both:] - value) / length]
     slopes = jnp.moveaxis(jnp.concatenate(slopes), 0, 1)
     r = jnp.where(shots.measured, (shots.y - value) / sigma, 0.0)
@@ -194,35 +197,6 @@ def expand(
     slopes = slopes.reshape(windows, d + n, -1)
     none = jnp.zeros((windows, still.size, slopes.shape[-1]), slopes.dtype)
     return r.reshape(windows, -1), jnp.concatenate([slopes[:, :d], none, slopes[:, d:]], 1)
-
-
-def normal_equations(
-    r: Float[Array, "windows k"], slopes: Float[Array, "windows dn k"], own: Float[Array, " d"], scaled: Array
-) -> Curvature:
-    """Of residuals and slopes as `expand` gives them; `own` and `scaled` are z and δ/S less their priors' means."""
-    d, n = own.size, scaled.shape[-1]
-    products = jnp.einsum("wik,wjk->wij", slopes, slopes)
-    pulls = jnp.einsum("wik,wk->wi", slopes, r)
-    return Curvature(
-        cost=0.5 * ((r**2).sum() + own @ own + (scaled**2).sum()),
-        hessian=products[:, :d, :d].sum(0) + jnp.eye(d),
-        gradient=pulls[:, :d].sum(0) - own,
-        own=products[:, d:, d:] + jnp.eye(n),
-        cross=products[:, d:, :d],
-        own_gradient=pulls[:, d:] - scaled,
-        pulls=pulls[:, :d],
-    )
-
-
-def eliminate(c: Curvature, damping: Scalar | float = 0.0) -> tuple[Array, Array, Array, Array]:
-    """Precision of z after the δ are eliminated, its gradient, and per window own⁻¹ cross and own⁻¹ gradient."""
-    n = c.own.shape[-1]
-    own = c.own + damping * jnp.eye(n) * jnp.diagonal(c.own, axis1=-2, axis2=-1)[..., None]
-    solved = jnp.linalg.solve(own, jnp.concatenate([c.cross, c.own_gradient[..., None]], axis=-1))
-    toward, shift = solved[..., :-1], solved[..., -1]
-    precision = c.hessian - jnp.einsum("wni,wnj->ij", c.cross, toward)
-    gradient = c.gradient - jnp.einsum("wni,wn->i", c.cross, shift)
-    return precision, gradient, toward, shift
 
 
 COMPILER_OPTIONS = {
@@ -238,128 +212,78 @@ FEW_CALLS = COMPILER_OPTIONS | {"xla_backend_optimization_level": 0}
 the time, and some three times slower."""
 
 
-@struct.dataclass
-class _March:
-    """Where Levenberg and Marquardt's method stands: a point that is tried, and the best one so far."""
-
-    tried: tuple[Float[Array, " d"], Float[Array, "windows n"]]
-    kept: tuple[Float[Array, " d"], Float[Array, "windows n"]]
-    seen: tuple[Float[Array, "windows k"], Float[Array, "windows dn k"]]
-    """Residuals and slopes at the best one."""
-    here: Curvature
-    damping: Scalar
-    promised: Scalar
-    """By how much the cost should fall from the best one to the one that is tried."""
-    count: Int[Array, ""]
-    small: Int[Array, ""]
-    """Accepted steps in a row that lowered the cost by next to nothing."""
+_look = trace_once(
+    expand, static_argnames=("predict", "step", "live"), compiler_options=COMPILER_OPTIONS, to_numpy=True
+)
 
 
-@struct.dataclass
-class _Terms:
-    """What a fit is held by beside the recordings, and what it may change."""
+@dataclass(frozen=True)
+class _Point:
+    """Where a fit stands."""
 
-    free: Bool[Array, " d"]
-    center: Float[Array, " d"] | float
-    shift: Float[Array, "windows n"] | float
-    spread: Float[Array, " n"]
-    bounded: Bool[Array, " d"] | bool
-    tolerance: float
-
-
-def _set_out(z: Array, delta: Array, rest: int, damping: float | Scalar) -> _March:
-    """Before anything is simulated, of NumPy's numbers."""
-    kind, d, (windows, n) = z.dtype, z.size, delta.shape
-    zeros: Any = partial(np.zeros, dtype=kind)
-    nothing = Curvature(
-        cost=zeros(()) + np.inf,
-        hessian=zeros((d, d)),
-        gradient=zeros(d),
-        own=zeros((windows, n, n)),
-        cross=zeros((windows, n, d)),
-        own_gradient=zeros((windows, n)),
-        pulls=zeros((windows, d)),
-    )
-    seen = (zeros((windows, rest)), zeros((windows, d + n, rest)))
-    none: Any = np.zeros((), int)
-    return _March((z, delta), (z, delta), seen, nothing, jnp.asarray(damping, kind), zeros(()), none, none)
+    z: Float[np.ndarray, " d"]
+    delta: Float[np.ndarray, "windows n"]
+    r: Float[np.ndarray, "windows k"]
+    slopes: Float[np.ndarray, "windows dn k"]
+    curvature: Curvature
+    left: float
+    """By how much the cost falls to its least, were residuals linear; infinite where something is not finite."""
 
 
-def _advance(march: _March, seen: tuple[Array, Array], terms: _Terms) -> _March:
-    """One step, after the point that is tried has been simulated."""
-    tried, here, damping = march.tried, march.here, march.damping
-    there = normal_equations(*seen, tried[0] - terms.center, (tried[1] - terms.shift) / terms.spread)
-    sound = jnp.isfinite(there.cost) & jnp.isfinite(there.gradient).all() & jnp.isfinite(there.hessian).all()
-    better = sound & (there.cost <= here.cost)
-    gain = jnp.where(better, (here.cost - there.cost) / jnp.maximum(jnp.abs(here.cost), 1e-12), 1.0)
-    gain = jnp.where(jnp.isfinite(gain), gain, 1.0)
-    fulfilled = (here.cost - there.cost) / jnp.maximum(march.promised, 1e-300)
-    eased = jnp.where(fulfilled > 0.75, damping / 5, jnp.where(fulfilled > 0.25, damping, damping * 2))
-    damping = jnp.where(better, jnp.maximum(eased, 1e-9), damping * 8).astype(march.damping.dtype)
-    small = jnp.where(better & (gain < terms.tolerance), march.small + 1, jnp.where(better, 0, march.small))
-    best = (march.kept, march.seen, here)
-    kept, seen, here = jax.tree.map(lambda x, y: jnp.where(better, x, y), (tried, seen, there), best)
-    tried, promised = _propose(kept, here, damping, terms)
-    return _March(tried, kept, seen, here, damping, promised, march.count + 1, small)
+class _Problem:
+    """What is fitted to what, in NumPy's numbers."""
 
+    def __init__(
+        self, predict: Predict, shots: Shots, sigma: np.ndarray, free: np.ndarray, step: float, live: int | None
+    ) -> None:
+        self.predict, self.shots, self.sigma, self.free, self.step, self.live = predict, shots, sigma, free, step, live
+        self.center, self.shift = np.asarray(shots.center), np.asarray(shots.shift)
+        self.spread, self.bounded = np.asarray(shots.spread), np.asarray(shots.bounded)
 
-def _propose(
-    at: tuple[Array, Array], here: Curvature, damping: Array, terms: _Terms
-) -> tuple[tuple[Array, Array], Array]:
-    """Where a step leads, and by how much the cost should fall."""
-    free = terms.free
-    precision, gradient, toward, shift = eliminate(here, damping)
-    precision = jnp.where(jnp.outer(free, free), precision, jnp.eye(free.size))
-    precision = precision + damping * jnp.diag(jnp.diagonal(here.hessian))
-    move = jnp.where(free, jnp.linalg.solve(precision, jnp.where(free, gradient, 0.0)), 0.0)
-    to, move = stride(at[0], move, terms.bounded, LONGEST)
-    moves = shift - toward @ move
-    stiff = move**2 @ jnp.diagonal(here.hessian) + (moves**2 * jnp.diagonal(here.own, axis1=-2, axis2=-1)).sum()
-    promised = 0.5 * (move @ here.gradient + (moves * here.own_gradient).sum() + damping * stiff)
-    return (to, at[1] + moves * terms.spread), promised
+    def look(self, z: np.ndarray, delta: np.ndarray, alone: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals over σ and slopes; these are wrong where the point is simulated `alone`."""
+        return _look(self.predict, self.shots, z, delta, self.sigma, self.step, self.live, np.asarray(alone))
 
+    def cost(self, z: np.ndarray, delta: np.ndarray) -> float:
+        """What is made least."""
+        r, own, scaled = self.look(z, delta, alone=True)[0], z - self.center, (delta - self.shift) / self.spread
+        return float(0.5 * ((r**2).sum() + own @ own + (scaled**2).sum()))
 
-def stride(
-    z: Float[Array, " d"], move: Float[Array, " d"], bounded: Bool[Array, " d"] | bool, longest: float
-) -> tuple[Float[Array, " d"], Float[Array, " d"]]:
-    """Where a step along the slopes at z leads, and the part of it that is taken.
+    def at(self, z: np.ndarray, delta: np.ndarray, seen: tuple[np.ndarray, np.ndarray] | None = None) -> _Point:
+        """A point; what is `seen` there is simulated unless told."""
+        r, slopes = self.look(z, delta) if seen is None else seen
+        curvature = normal_equations(r, slopes, z - self.center, (delta - self.shift) / self.spread)
+        sound = all(np.isfinite(x).all() for x in (curvature.cost, curvature.hessian, curvature.gradient))
+        return _Point(z, delta, r, slopes, curvature, within_reach(curvature, self.free) if sound else np.inf)
 
-    What is `bounded` is at Φ(z) of its interval. At its ends Φ is flat: a step back from there would be far too long,
-    and so small a part of it would be taken, of all other directions as well. Such a step is as long as it is in Φ.
-    Of all others none is longer than `longest`.
-    """
+    def propose(self, point: _Point, damping: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """Where a damped step leads, and by how much the cost should fall."""
+        return propose(point.curvature, damping, self.free, self.bounded, self.spread, point.z, point.delta, LONGEST)
 
-    def lead(move: Float[Array, " d"]) -> Float[Array, " d"]:
-        inward = ndtri(jnp.clip(ndtr(z) + norm.pdf(z) * move, OUTERMOST, 1.0 - OUTERMOST)) - z
-        return jnp.where(bounded & (inward * move > 0.0) & (jnp.abs(inward) < jnp.abs(move)), inward, move)
+    def finish(self, point: _Point) -> _Point:
+        """The last step, which is so short that residuals are linear."""
+        z, delta, _ = self.propose(point, 0.0)
+        move = np.concatenate(
+            [np.broadcast_to(z - point.z, (len(delta), z.size)), (delta - point.delta) / self.spread], 1
+        )
+        return self.at(z, delta, (point.r - (move[:, None] @ point.slopes)[:, 0], point.slopes))
 
-    free = jnp.where(lead(move) == move, jnp.abs(move), 0.0).max(initial=0.0)
-    taken = move * jnp.minimum(1.0, longest / jnp.maximum(free, 1e-12))
-    return z + lead(taken), taken
-
-
-def _arrive(march: _March, sigma: Array, terms: _Terms, shape: tuple[int, ...]) -> Fit:
-    """The best point as a fit."""
-    (z, delta), (r, slopes), here, free = march.kept, march.seen, march.here, terms.free
-    precision, _, _, shift = eliminate(here)
-    return Fit(
-        z=z,
-        delta=delta,
-        sigma=sigma,
-        precision=jnp.where(jnp.outer(free, free), precision, jnp.eye(free.size)),
-        pulls=jnp.where(free, here.pulls - jnp.einsum("wni,wn->wi", here.cross, shift), 0.0),
-        r=r.reshape(shape),
-        slopes=slopes,
-        cost=here.cost,
-        steps=march.count,
-        converged=(march.small >= 2) | (march.damping >= 1e9),
-        damping=march.damping,
-    )
-
-
-_look = trace_once(expand, static_argnames=("predict", "step", "live"), compiler_options=COMPILER_OPTIONS)
-_go_on = trace_once(_advance, compiler_options=COMPILER_OPTIONS)
-_end = trace_once(_arrive, static_argnames="shape", compiler_options=FEW_CALLS, to_numpy=True)
+    def end(self, point: _Point, **how: Any) -> Fit:
+        """A point as a fit."""
+        c, held, known = point.curvature, self.free, point.left < np.inf
+        precision, _, _, shift = eliminate(c) if known else (c.hessian, None, None, np.zeros_like(c.own_gradient))
+        pulls = own_pulls(c, shift)
+        found: dict[str, Any] = {
+            "precision": np.where(np.outer(held, held), precision, np.eye(held.size, dtype=point.z.dtype)),
+            "pulls": np.where(held, pulls, 0.0),
+            "r": point.r.reshape(self.shots.y.shape),
+            "cost": c.cost if known else np.asarray(np.inf, point.z.dtype),
+            "z": point.z,
+            "delta": point.delta,
+            "sigma": self.sigma,
+            "slopes": point.slopes,
+        }
+        return Fit(**found, **how)
 
 
 def solve(
@@ -372,41 +296,60 @@ def solve(
     *,
     steps: int = 30,
     step: float = 0.0,
-    damping: float | Scalar = DAMPING,
+    damping: float = DAMPING,
     live: int | None = None,
+    known: Fit | None = None,
+    tolerance: float | None = None,
 ) -> Fit:
     """Levenberg-Marquardt on (z, δ₁, …, δ_W) from a starting point; z stays as it is where it is not `free`.
 
-    The simulator depends on the first `live` of z, on all unless told.
+    The simulator depends on the first `live` of z, on all unless told. `known` is a fit of the same to the same windows
+    that ended at the starting point, with whatever noise: what was found there is not simulated again.
 
     A step that does not lower the cost, or leads to a number that is not finite, is refused and shortened; where the
     cost falls by less than a quarter of what the slopes promise, the next one is shorter, too. `damping` is where that
-    begins. The solver has converged when two accepted steps in a row lower the cost by less than 1e-7 of it (1e-4 where
-    `step` is told, as where bodies collide), or when no step does.
+    begins. A point that is tried is simulated once, and those beside it only where it is better. The solver has
+    converged when the slopes promise that the cost falls by less than 1e-3 to its least, and takes that step without
+    simulating it; when two accepted steps in a row lower the cost by less than a `tolerance` of it, 1e-7 (1e-4 where
+    `step` is told, as where bodies collide); or when no step does.
 
-    Only the simulation and its derivatives are compiled for a `predict`; the algebra is compiled once for all of the
-    same size.
+    Only the simulation of points and of those beside them is compiled.
     """
     kind = jnp.result_type(z)
-    at, beside, noise = (jax.device_put(np.asarray(x, kind)) for x in (z, delta, sigma))
-    terms = _Terms(
-        jax.device_put(np.asarray(free)),
-        shots.center,
-        shots.shift,
-        shots.spread,
-        shots.bounded,
-        ROUGH if step else TOLERANCE,
-    )
-    march = _set_out(at, beside, shots.y.shape[1] * shots.y.shape[2], damping)
-    for _ in range(int(steps)):
-        march = _go_on(march, _look(predict, shots, *march.tried, noise, step, live), terms)
-        small, last, cost = jax.device_get((march.small, march.damping, march.here.cost))
-        if small >= 2 or last >= 1e9 or not np.isfinite(cost):
-            break
-    return _end(march, noise, terms, shots.y.shape)
+    at, beside, noise = (np.asarray(x, kind) for x in (z, delta, sigma))
+    problem = _Problem(predict, shots, noise, np.asarray(free), step, live)
+    least = (ROUGH if step else TOLERANCE) if tolerance is None else tolerance
+    damping, small, count = float(damping), 0, 1
+    with np.errstate(all="ignore"):
+        point = problem.at(at, beside, _rescaled(known, noise))
+        while count < steps and SETTLED <= point.left < np.inf and small < 2 and damping < STUCK:
+            count += 1
+            to, moved, promised = problem.propose(point, damping)
+            cost = float(point.curvature.cost)
+            fall = cost - problem.cost(to, moved)
+            there = problem.at(to, moved) if fall >= 0.0 else None
+            # where a simulation ends well those beside it may not
+            if there is None or there.left == np.inf:
+                damping *= 8
+                continue
+            eased = 1 / 5 if fall > 0.75 * promised else 1 if fall > 0.25 * promised else 2
+            damping, point = max(damping * eased, LEAST), there
+            small = small + 1 if fall < least * max(abs(cost), 1e-12) else 0
+        converged = small >= 2 or damping >= STUCK or point.left < SETTLED
+        point = problem.finish(point) if point.left < SETTLED else point
+        return problem.end(point, steps=count, converged=converged, damping=damping)
 
 
-@trace_once(compiler_options=FEW_CALLS, to_numpy=True)
+def _rescaled(known: Fit | None, sigma: Float[np.ndarray, " obs"]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Residuals and slopes of a fit, if there is one, over another noise."""
+    if known is None:
+        return None
+    by = np.asarray(known.sigma) / sigma
+    r, slopes = np.asarray(known.r) * by, np.asarray(known.slopes)
+    scaled = slopes.reshape(*slopes.shape[:2], -1, by.size) * by
+    return r.reshape(len(r), -1), scaled.reshape(slopes.shape)
+
+
 def robust_covariance(fit: Fit) -> Float[np.ndarray, "d d"]:
     """Covariance of z where the model is only nearly right: Laplace's, wider where windows disagree more than noise.
 
@@ -415,9 +358,10 @@ def robust_covariance(fit: Fit) -> Float[np.ndarray, "d d"]:
 
     Source: White 1982
     """
-    root = jnp.linalg.inv(jnp.linalg.cholesky(fit.precision)).T
-    values, axes = jnp.linalg.eigh(jnp.einsum("wi,wj->ij", fit.pulls @ root, fit.pulls @ root))
-    wide = root @ (axes * jnp.sqrt(jnp.maximum(values, 1.0)))
+    root = np.linalg.inv(np.linalg.cholesky(np.asarray(fit.precision))).T
+    pulls = np.asarray(fit.pulls) @ root
+    values, axes = np.linalg.eigh(pulls.T @ pulls)
+    wide = root @ (axes * np.sqrt(np.maximum(values, 1.0)))
     return wide @ wide.T
 
 

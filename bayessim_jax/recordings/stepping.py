@@ -27,10 +27,10 @@ from bayessim_jax.beliefs.margins import Margins, normal
 from bayessim_jax.diagnosis.bench import Bench, Candidate
 from bayessim_jax.diagnosis.verdict import Entry
 from bayessim_jax.diagnosis.whiteness import difference_noise
+from bayessim_jax.inference.arrow import eliminate, normal_equations, own_pulls
 from bayessim_jax.inference.direct import estimate_noise, fit_direct, noise_floor
 from bayessim_jax.inference.replay import Inputs, Restarted
-from bayessim_jax.inference.shooting import FEW_CALLS, Fit, Predict, Shots, eliminate, normal_equations
-from bayessim_jax.programs import trace_once
+from bayessim_jax.inference.shooting import Fit, Predict, Shots
 from bayessim_jax.recordings.late import BLUR, is_runge_kutta, measure_lag
 from bayessim_jax.recordings.shots import (
     REFINED,
@@ -108,7 +108,12 @@ class Settled:
 
 
 def settle_step(
-    key: Array, model: CaseModel, windows: Windows, *, say: Callable[[str], None] = lambda text: None
+    key: Array,
+    model: CaseModel,
+    windows: Windows,
+    *,
+    tolerance: float | None = None,
+    say: Callable[[str], None] = lambda text: None,
 ) -> Settled:
     """Fit a case and the time step of what was recorded, with a finer simulation where the model's is too coarse.
 
@@ -121,6 +126,8 @@ def settle_step(
     A model that takes steps of Runge and Kutta may be believed of what took those of semi-implicit Euler, whose
     positions are ahead by h/2 of their motion. Where velocities are measured these tell (`late`); else s is fitted,
     between none for Runge and Kutta's steps and one for Euler's of the model's own length.
+
+    `tolerance` is the solver's.
     """
     margins = model.margins + Margins.create(["time step"], [RATIO])
     shots = model.shots(windows)
@@ -128,7 +135,8 @@ def settle_step(
     nodes = (0.0, 1.0, 1 / REFINED) if mixed else (1.0, 1 / REFINED)
     predict = Stepped(predictor(model), nodes)
     first = _with_runs(shots, np.zeros((len(shots.y), len(nodes), *shots.y.shape[1:])))
-    fit = fit_direct(key, predict, first, margins.size, step=model.step, say=say)
+    how = {"tolerance": tolerance, "say": say}
+    fit = fit_direct(key, predict, first, margins.size, step=model.step, **how)
     if isinstance(model.system, Restarted):
         return Settled(model, fit, predict, first, margins, np.zeros(shots.y.shape))
     finer = case_model(model.case, engine=model.engine_name, before=model.before, refined=REFINED)
@@ -154,7 +162,7 @@ def settle_step(
         for turn in range(PASSES):
             calm = tame(runs, shots)
             seen = _with_runs(shots, calm)
-            found = fit_direct(key, predict, seen, margins.size, start=found, step=base.step, say=say)
+            found = fit_direct(key, predict, seen, margins.size, start=found, step=base.step, **how)
             ratio = float(RATIO.value(found.z[-1]))
             here = dataclasses.replace(error, z=found.z[:-1]).runs(shots, base.refined, found.delta)
             change, counts = _size(shots, found, interpolate(error.nodes, ratio, tame(here, shots) - calm))
@@ -261,14 +269,14 @@ def _infer_ratio(
     return float(mean + sd * (z[k] + move[k])), float(sd * width[k]), wide
 
 
-@trace_once(compiler_options=FEW_CALLS, to_numpy=True)
-def _step_all(r: Array, slopes: Array, z: Array, scaled: Array) -> tuple[Array, Array, Array, Array]:
+def _step_all(
+    r: np.ndarray, slopes: np.ndarray, z: np.ndarray, scaled: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Precision of all of z and every window's pull on it, a Gauss-Newton step, and its standard deviations."""
     c = normal_equations(r, slopes, z, scaled)
     precision, gradient, _, shift = eliminate(c)
-    covariance = jnp.linalg.inv(precision)
-    pulls = c.pulls - jnp.einsum("wni,wn->wi", c.cross, shift)
-    return precision, pulls, covariance @ gradient, jnp.sqrt(jnp.diagonal(covariance))
+    covariance = np.linalg.inv(precision)
+    return precision, own_pulls(c, shift), covariance @ gradient, np.sqrt(covariance.diagonal())
 
 
 def _along(

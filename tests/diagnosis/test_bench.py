@@ -24,9 +24,10 @@ from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.diagnosis.screen import Begun
 from bayessim_jax.diagnosis.verdict import error_left
 from bayessim_jax.effects import EFFECTS, EffectParameter, Scales
+from bayessim_jax.inference.arrow import normal_equations
 from bayessim_jax.inference.direct import estimate_noise
 from bayessim_jax.inference.replay import replay_window
-from bayessim_jax.inference.shooting import normal_equations, predict_all, solve
+from bayessim_jax.inference.shooting import predict_all, solve
 from bayessim_jax.recordings.loading import load_case
 from bayessim_jax.recordings.shots import case_model
 from benchmarks.worlds import make_case

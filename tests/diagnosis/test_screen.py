@@ -8,7 +8,7 @@ import pytest
 
 from bayessim_jax.diagnosis.bench import Candidate
 from bayessim_jax.diagnosis.screen import March, Screen, Screened
-from bayessim_jax.inference.shooting import Curvature
+from bayessim_jax.inference.arrow import Curvature
 
 DEEPEST = 1.3
 """The lowest of the minima, one of them every 1.2 or so."""

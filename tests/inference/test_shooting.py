@@ -6,18 +6,10 @@ import numpy as np
 import pytest
 
 from bayessim_jax.beliefs.margins import Margins, normal
+from bayessim_jax.inference import shooting
+from bayessim_jax.inference.arrow import eliminate, normal_equations, stride
 from bayessim_jax.inference.direct import fit_direct, noise_floor, sample_direct
-from bayessim_jax.inference.shooting import (
-    Shots,
-    eliminate,
-    expand,
-    normal_equations,
-    profile,
-    ridge,
-    robust_covariance,
-    solve,
-    stride,
-)
+from bayessim_jax.inference.shooting import Shots, expand, profile, ridge, robust_covariance, solve
 
 WINDOWS, ROWS = 6, 12
 SIGMA = 0.3
@@ -159,6 +151,70 @@ def test_a_step_back_from_the_edge_of_an_interval_is_no_obstacle(edge):
         np.testing.assert_allclose(jnp.abs(taken).max(), 2.0)
 
 
+def counted(monkeypatch):
+    """Whether each point that the solver simulates from here on is simulated alone."""
+    alone, look = [], shooting._look
+
+    def noted(*given):
+        alone.append(bool(given[-1]))
+        return look(*given)
+
+    monkeypatch.setattr(shooting, "_look", noted)
+    return alone
+
+
+def test_a_point_alone_has_the_residuals_that_it_has_among_others():
+    shots, _ = line_data(7)
+    given = line, shots, jnp.array([0.3, -0.1]), jnp.full((WINDOWS, 1), 0.1), jnp.array([SIGMA])
+    whole, alone = (shooting._look(*given, 0.0, None, np.asarray(flag)) for flag in (False, True))
+    np.testing.assert_array_equal(alone[0], whole[0])
+    assert np.abs(alone[1] - whole[1]).max() > 1.0, "derivatives cost nothing where they are not asked for"
+
+
+def test_derivatives_are_computed_where_a_step_was_accepted_only(monkeypatch):
+    """On a winding way steps are too long and refused; a linear simulator's never are."""
+
+    def winding(z, delta, window):
+        return line(z + 0.18 * jnp.sin(5.0 * z), delta, window)
+
+    shots, _ = line_data(6, sigma=0.01)
+    given = jnp.zeros((WINDOWS, 1)), jnp.array([0.01]), jnp.ones(2, bool)
+    alone = counted(monkeypatch)
+    solve(line, shots, jnp.array([0.3, -0.2]), *given)
+    assert alone == [False, *[True, False] * (len(alone) // 2)]
+    alone.clear()
+    fit = solve(winding, shots, jnp.array([3.0, -2.0]), *given, damping=1e-9)
+    refused = alone.count(True) - (alone.count(False) - 1)
+    assert refused > 0 and fit.converged and fit.steps == alone.count(True) + 1
+
+
+def test_a_fit_that_is_known_is_not_simulated_again(monkeypatch):
+    shots, _ = line_data(8)
+    first = solved(line, shots)
+    alone = counted(monkeypatch)
+    same = solve(line, shots, first.z, first.delta, first.sigma, np.ones(2, bool), known=first)
+    assert not alone and same.converged
+    np.testing.assert_allclose(same.z, first.z, atol=1e-9)
+    # at another noise the prior weighs more: one linear step, which is not simulated where it is short
+    other = solve(line, shots, first.z, first.delta, 2.0 * first.sigma, np.ones(2, bool), known=first)
+    assert alone.count(False) == alone.count(True) > 0
+    np.testing.assert_allclose(other.z, exact(shots, 2.0 * SIGMA)[0], atol=1e-6)
+
+
+def test_a_simulator_that_ends_where_those_beside_it_do_not_is_no_place_to_stop():
+    """sqrt has no derivative from below at 0, where a step of the linear one leads."""
+
+    def rooted(z, delta, window):
+        return line(jnp.array([1.0, 0.0]) * jnp.sqrt(z[0] + 1.0), delta, window)
+
+    shots, _ = line_data(9)
+    given = jnp.zeros((WINDOWS, 1)), jnp.array([SIGMA])
+    broken = solve(rooted, shots, jnp.array([-2.0, 0.0]), *given, np.ones(2, bool))
+    assert not np.isfinite(broken.cost) and not broken.converged
+    fit = solve(rooted, shots, jnp.array([-1.0 + 1e-5, 0.0]), *given, np.ones(2, bool))
+    assert np.isfinite(fit.cost) and np.isfinite(fit.precision).all() and fit.z[0] > -1.0
+
+
 def test_parameters_that_are_not_free_stay():
     shots, _ = line_data(4)
     start = jnp.array([0.3, -0.2])
@@ -171,7 +227,8 @@ def test_parameters_that_are_not_free_stay():
 def test_elimination_leaves_the_same_answer_as_the_whole_system():
     shots, _ = line_data(5)
     z, delta = jnp.array([0.1, 0.2]), jnp.zeros((WINDOWS, 1))
-    c = normal_equations(*expand(line, shots, z, delta, jnp.array([SIGMA])), z, delta)
+    r, slopes = map(np.asarray, expand(line, shots, z, delta, jnp.array([SIGMA])))
+    c = normal_equations(r, slopes, np.asarray(z), np.asarray(delta))
     precision, gradient, _, _ = eliminate(c)
     whole = np.zeros((2 + WINDOWS, 2 + WINDOWS))
     whole[:2, :2] = c.hessian
