@@ -22,6 +22,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from bayessim_jax.engines.batch import map_in_blocks
 from bayessim_jax.inference.arrow import Curvature
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS, FEW_CALLS
 from bayessim_jax.programs import trace_once
@@ -167,7 +168,9 @@ def _miss(engine: Any, substeps: int, row: tuple[Array, ...], move: Array, force
 
 def _miss_all(engine: Any, substeps: int, motion: Motion, move: Array, force: Array, inner: Array) -> Array:
     """The same of every row of every window."""
-    return jax.vmap(jax.vmap(lambda *row: _miss(engine, substeps, row, move, force, inner)))(*_rows(motion))
+    rows = [x.reshape(-1, x.shape[-1]) for x in _rows(motion)]
+    found = map_in_blocks(lambda *row: _miss(engine, substeps, row, move, force, inner), *rows)
+    return found.reshape(*motion.ctrl.shape[:2], -1)
 
 
 @struct.dataclass

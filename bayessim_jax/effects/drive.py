@@ -93,7 +93,8 @@ def probe_inertia(engine: Any, theta: Float[Array, " d"], qpos: Float[Array, " n
     push = float(nominal_inertia(model, model.qpos0, mujoco.MjData(model))[dof]) / float(model.opt.timestep)
     state = engine.init(theta, qpos, jnp.zeros(model.nv, kind))
     ctrl, applied = jnp.zeros(model.nu, kind), jnp.zeros(model.nv, kind)
-    still, moved = (engine.qvel(engine.step(theta, state, ctrl, f))[dof] for f in (applied, applied.at[dof].set(push)))
+    pushed = jnp.stack([applied, applied.at[dof].set(push)])
+    still, moved = jax.vmap(lambda f: engine.qvel(engine.step(theta, state, ctrl, f))[dof])(pushed)
     return push * float(model.opt.timestep) / (moved - still)
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from bayessim_jax.engines.tree.constraints import SOLVER
 
-__all__ = ["TASKS", "WIDE", "compile_batched", "compile_spread", "forward_jacobians"]
+__all__ = ["TASKS", "WIDE", "compile_batched", "compile_spread", "forward_jacobians", "map_in_blocks"]
 
 TASKS = "cpu-parallel-task-assigner"
 """The pass of XLA that hands every operation of a time step to a pool of threads, which costs many times the operation
@@ -61,6 +61,15 @@ def compile_spread(function: Callable[..., Any], *arguments: Any, out_axes: Any 
     spread = jax.shard_map(share, mesh=mesh, in_specs=PartitionSpec("batch"), out_specs=specs, check_vma=False)
     traced = jax.jit(spread).trace(*placed)
     return traced.lower().compile(compiler_options=SOLVERS if _solves(traced.jaxpr) else LOOPS), placed
+
+
+def map_in_blocks(function: Callable[..., Any], *batch: Any) -> Any:
+    """`jax.vmap(function)` over a leading axis while tracing: on a CPU blocks of some 128 follow each other."""
+    size = jax.tree.leaves(batch)[0].shape[0]
+    if jax.default_backend() != "cpu":
+        return jax.vmap(function)(*batch)
+    axes = jax.tree.map(lambda _: 0, jax.eval_shape(function, *jax.tree.map(lambda x: x[0], batch)))
+    return _in_blocks(jax.vmap(function), *batch, axes=axes, block=_block(size))
 
 
 def _block(size: int) -> int:

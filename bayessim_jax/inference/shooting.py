@@ -60,8 +60,8 @@ SETTLED = 1e-3
 """By how much the cost may still fall where the last step, a twentieth of a standard deviation, is not simulated."""
 LEAST, STUCK = 1e-9, 1e9
 """Damping at least, and so much that no step helps."""
-TOGETHER = 28
-"""Windows that a processor simulates at a time at least: a point alone costs its share, and vectors are full."""
+MANY = 16
+"""Windows that fill a processor's vectors, so that points are simulated one after the other."""
 LONGEST = 2.0
 """The longest step of z."""
 
@@ -166,30 +166,27 @@ def expand(
 
     Differences of length ε^⅓, with ε what numbers of this kind resolve: central ones along z, where a ridge must not
     look informed, and forward ones along δ, which move far less than a simulator bends. Where it is not smooth all are
-    central, of length `step`. The point and those beside it are simulated by one loop: the compiler meets a simulator
-    once, where forward-mode derivatives of it make a program several times as large (`docs/architecture.md`). Of z
-    only the first `live` matter to the simulator, all unless told. With the point `alone` only the residuals are right.
+    central, of length `step`. The point and those beside it are simulated by one loop or as one batch: the compiler
+    meets a simulator once, where forward-mode derivatives of it make a program several times as large
+    (`docs/architecture.md`). Of z only the first `live` matter to the simulator, all unless told. With the point
+    `alone` slopes need not be right.
     """
     d, n, windows = z.size if live is None else live, delta.shape[-1], delta.shape[0]
     still = jnp.zeros(z.size - d, z.dtype)
     length = step or float(jnp.finfo(z.dtype).eps) ** (1 / 3)
     both = d + n if step else d
     count = 1 + d + n + both
-    together = min(-(-TOGETHER // windows), count) if jax.default_backend() == "cpu" else count
-    runs = -(-count // together)
-    ways = jnp.concatenate([jnp.zeros((1, d + n)), jnp.eye(d + n), -jnp.eye(both, d + n)])
-    ways = length * jnp.pad(ways, ((0, runs * together - count), (0, 0)))
+    ways = length * jnp.concatenate([jnp.zeros((1, d + n)), jnp.eye(d + n), -jnp.eye(both, d + n)])
     # points outside and windows inside: z is common to all windows, and theirs lie side by side
     moved = lambda way: z + jnp.concatenate([way[:d], still])  # noqa: E731
     run = lambda way: predict_all(predict, shots, moved(way), delta + way[d:] * shots.spread)  # noqa: E731
-
-    def go_on(k: Array, y: Array) -> Array:
-        some = jax.lax.dynamic_slice_in_dim(ways, k * together, together)
-        return jax.lax.dynamic_update_slice_in_dim(y, jax.vmap(run)(some), k * together, 0)
-
-    y = jnp.zeros((runs * together, *shots.y.shape), jnp.result_type(z, shots.y))
-    y = jax.lax.fori_loop(0, jnp.where(alone, 1, runs) if isinstance(alone, Array) else runs, go_on, y)
-    value, ahead, behind = y[0], y[1 : 1 + d + n], y[1 + d + n : count]
+    if jax.default_backend() == "cpu" and windows >= MANY:
+        runs = jnp.where(alone, 1, count) if isinstance(alone, Array) else count
+        nothing = jnp.zeros((count, *shots.y.shape), jnp.result_type(z, shots.y))
+        y = jax.lax.fori_loop(0, runs, lambda k, y: y.at[k].set(run(ways[k])), nothing)
+    else:
+        y = jax.vmap(run)(ways)
+    value, ahead, behind = y[0], y[1 : 1 + d + n], y[1 + d + n :]
     slopes = [(ahead[:both] - behind) / (2 * length), (ahead[both:] - value) / length]
     slopes = jnp.moveaxis(jnp.concatenate(slopes), 0, 1)
     r = jnp.where(shots.measured, (shots.y - value) / sigma, 0.0)

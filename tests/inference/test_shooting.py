@@ -12,6 +12,7 @@ from bayessim_jax.inference.direct import fit_direct, noise_floor, sample_direct
 from bayessim_jax.inference.shooting import Shots, expand, profile, ridge, robust_covariance, solve
 
 WINDOWS, ROWS = 6, 12
+FIELDS = ("inputs", "y", "measured")
 SIGMA = 0.3
 
 
@@ -163,12 +164,20 @@ def counted(monkeypatch):
     return alone
 
 
-def test_a_point_alone_has_the_residuals_that_it_has_among_others():
-    shots, _ = line_data(7)
-    given = line, shots, jnp.array([0.3, -0.1]), jnp.full((WINDOWS, 1), 0.1), jnp.array([SIGMA])
+@pytest.mark.parametrize("windows", [WINDOWS, shooting.MANY])
+def test_a_point_alone_has_the_residuals_that_it_has_among_others(windows):
+    few, _ = line_data(7)
+    many = {name: jnp.resize(x, (windows, *x.shape[1:])) for name in FIELDS for x in [getattr(few, name)]}
+    shots = few.replace(**many)
+    given = line, shots, jnp.array([0.3, -0.1]), jnp.full((windows, 1), 0.1), jnp.array([SIGMA])
     whole, alone = (shooting._look(*given, 0.0, None, np.asarray(flag)) for flag in (False, True))
     np.testing.assert_array_equal(alone[0], whole[0])
-    assert np.abs(alone[1] - whole[1]).max() > 1.0, "derivatives cost nothing where they are not asked for"
+    # derivatives cost nothing where they are not asked for
+    assert (np.abs(alone[1] - whole[1]).max() > 1.0) == (windows >= shooting.MANY)
+    slopes = [jax.jacfwd(lambda z: line(z, jnp.zeros(1), 0.0))(given[2])[:, 0, i] / SIGMA for i in range(2)]
+    there = np.asarray(shots.measured)[..., 0]
+    for i in range(2):
+        np.testing.assert_allclose(whole[1][:, i], np.where(there, slopes[i], 0.0), atol=1e-6)
 
 
 def test_derivatives_are_computed_where_a_step_was_accepted_only(monkeypatch):
