@@ -125,9 +125,9 @@ class Forcing:
 class Rest:
     """What no candidate changes to first order: how readings over σ move with θ's z and with initial states."""
 
-    slopes: Float[Array, "windows dn rowsobs"]
+    slopes: Float[np.ndarray, "windows dn rowsobs"]
     """0 where nothing was measured."""
-    products: Float[Array, "windows dn dn"]
+    products: Float[np.ndarray, "windows dn dn"]
     """Of the slopes, summed over rows and channels."""
 
 
@@ -306,7 +306,7 @@ def _see(
     return jnp.moveaxis(apply(c, e), -1, 0)
 
 
-@trace_once(static_argnames="d", compiler_options=FEW_CALLS)
+@trace_once(static_argnames="d", compiler_options=FEW_CALLS, to_numpy=True)
 def respond(lin: Linearized, windowed: Windowed, d: int) -> Float[Array, "windows dn rowsobs"]:
     """How readings move with θ's z and with the initial state: what no candidate changes to first order."""
     count, steps, n = lin.gap.shape
@@ -316,25 +316,34 @@ def respond(lin: Linearized, windowed: Windowed, d: int) -> Float[Array, "window
     return slopes.at[:, d:].multiply(windowed.spread[:, None])
 
 
-@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
-def weigh(shared: Float[Array, "windows dn rowsobs"], windowed: Windowed, sigma: Float[Array, " obs"]) -> Rest:
+def weigh(shared: Float[np.ndarray, "windows dn rowsobs"], windowed: Windowed, sigma: Float[Array, " obs"]) -> Rest:
     """What `respond` says, over σ."""
-    weight = jnp.where(windowed.measured, 1.0 / sigma, 0.0)
-    slopes = shared * weight.reshape(len(weight), 1, -1)
-    return Rest(slopes, jnp.einsum("wik,wjk->wij", slopes, slopes))
+    weight = np.where(np.asarray(windowed.measured), 1.0 / np.asarray(sigma), 0.0)
+    return _rest_of(shared * weight.reshape(len(weight), 1, -1))
+
+
+def _rest_of(slopes: Float[np.ndarray, "windows dn rowsobs"]) -> Rest:
+    return Rest(slopes, slopes @ slopes.swapaxes(1, 2))
+
+
+def _read(rest: Rest, readings: Readings | None) -> Rest:
+    """The same as a candidate's sensors show it."""
+    if readings is None:
+        return rest
+    return _rest_of(rest.slopes * np.asarray(readings.scale).reshape(len(rest.slopes), 1, -1))
 
 
 def _foresee(
     lin: Linearized,
-    rest: Rest,
     windowed: Windowed,
     forcing: Forcing,
     moved: Float[Array, " k"],
     delta: Float[Array, "windows n"],
     sigma: Float[Array, " obs"],
-) -> tuple[Float[Array, "windows rowsobs"], Float[Array, "windows e rowsobs"], Rest]:
-    """Residuals over σ, and derivatives of what is predicted over σ: along the candidate's parameters, and the rest."""
-    count, e, d = len(delta), forcing.along.shape[-1], rest.slopes.shape[1] - delta.shape[-1]
+    d: int,
+) -> tuple[Float[Array, "windows rowsobs"], Float[Array, "windows e rowsobs"]]:
+    """Residuals over σ, and derivatives of what is predicted over σ along the candidate's parameters, after d of θ."""
+    count, e = len(delta), forcing.along.shape[-1]
     forced = lin.gap + jnp.einsum("wtnv,wtv->wtn", lin.b, forcing.force) + lin.along @ moved
     columns = lin.along[..., d : d + e] + jnp.einsum("wtnv,wtvk->wtnk", lin.b, forcing.along)
     readings = forcing.readings
@@ -345,69 +354,71 @@ def _foresee(
     if readings is not None:
         value = readings.scale * value + readings.shift
         own = readings.scale[..., None] * own + readings.along
-        slopes = rest.slopes * readings.scale.reshape(count, 1, -1)
-        rest = Rest(slopes, jnp.einsum("wik,wjk->wij", slopes, slopes))
     weight = jnp.where(windowed.measured, 1.0 / sigma, 0.0)
     r = jnp.where(windowed.measured, (windowed.y - value) / sigma, 0.0).reshape(count, -1)
-    return r, jnp.moveaxis((own * weight[..., None]).reshape(count, -1, e), 1, 2), rest
+    return r, jnp.moveaxis((own * weight[..., None]).reshape(count, -1, e), 1, 2)
 
 
-@trace_once(compiler_options=COMPILER_OPTIONS, to_numpy=True)
+_look_ahead = trace_once(_foresee, static_argnames="d", compiler_options=COMPILER_OPTIONS, to_numpy=True)
+
+
+@np.errstate(all="ignore")
 def assess(
     lin: Linearized,
     rest: Rest,
     windowed: Windowed,
     forcing: Forcing,
-    moved: Float[Array, " k"],
-    p: Float[Array, " k"],
+    moved: Float[np.ndarray, " k"],
+    p: Float[np.ndarray, " k"],
     delta: Float[Array, "windows n"],
     sigma: Float[Array, " obs"],
-) -> tuple[Curvature, Float[Array, "windows rows obs"]]:
+) -> tuple[Curvature, Float[np.ndarray, "windows rows obs"]]:
     """Normal equations, and residuals over σ.
 
     p is [θ's z, the candidate's x], each with a standard normal prior, and `moved` how far it is from where the steps
     were found; `rest` is of steps linearized there or nearby. Only what the candidate changes is computed anew.
     """
-    r, own, rest = _foresee(lin, rest, windowed, forcing, moved, delta, sigma)
-    (windows, n), scaled = delta.shape, delta / windowed.spread
+    (windows, n), scaled = delta.shape, np.asarray(delta) / np.asarray(windowed.spread)
     d = rest.slopes.shape[1] - n
-    room = p.size - d - own.shape[1]
-    both = jnp.concatenate([own, r[:, None]], 1)
-    along_rest = jnp.einsum("wik,wjk->wij", rest.slopes, both)
-    along_own = jnp.einsum("wik,wjk->wij", own, both)
+    r, own = _look_ahead(lin, windowed, forcing, moved, delta, sigma, d)
+    rest = _read(rest, forcing.readings)
+    both = np.concatenate([own, r[:, None]], 1).swapaxes(1, 2)
+    along_rest, along_own = rest.slopes @ both, own @ both
     beside, pull = along_rest[..., :-1], along_rest[..., -1]
-    hessian = jnp.block(
-        [[rest.products[:, :d, :d], beside[:, :d]], [jnp.swapaxes(beside[:, :d], 1, 2), along_own[..., :-1]]]
+    k = d + own.shape[1]
+    hessian, room = np.eye(p.size), p.size - k
+    hessian[:d, :d] += rest.products[:, :d, :d].sum(0)
+    hessian[:d, d:k] = beside[:, :d].sum(0)
+    hessian[d:k, :d] = hessian[:d, d:k].T
+    hessian[d:k, d:k] += along_own[..., :-1].sum(0)
+    pulls = np.concatenate([pull[:, :d], along_own[..., -1], np.zeros((windows, room))], 1)
+    curvature = Curvature(
+        cost=0.5 * float((r**2).sum() + p @ p + (scaled**2).sum()),
+        hessian=hessian,
+        gradient=pulls.sum(0) - p,
+        own=rest.products[:, d:, d:] + np.eye(n),
+        cross=np.concatenate([rest.products[:, d:, :d], beside[:, d:], np.zeros((windows, n, room))], -1),
+        own_gradient=pull[:, d:] - scaled,
+        pulls=pulls,
     )
-    pulls = jnp.concatenate([pull[:, :d], along_own[..., -1], jnp.zeros((windows, room))], 1)
-    cross = [rest.products[:, d:, :d], beside[:, d:], jnp.zeros((windows, n, room))]
-    equations: dict[str, Any] = {
-        "cost": 0.5 * ((r**2).sum() + p @ p + (scaled**2).sum()),
-        "hessian": jnp.pad(hessian.sum(0), (0, room)) + jnp.eye(p.size),
-        "gradient": pulls.sum(0) - p,
-        "own": rest.products[:, d:, d:] + jnp.eye(n),
-        "cross": jnp.concatenate(cross, -1),
-        "own_gradient": pull[:, d:] - scaled,
-        "pulls": pulls,
-    }
-    return Curvature(**equations), r.reshape(windowed.y.shape)
+    return curvature, r.reshape(windowed.y.shape)
 
 
-@partial(jax.jit, compiler_options=COMPILER_OPTIONS)
 def expand_response(
     lin: Linearized,
     rest: Rest,
     windowed: Windowed,
     forcing: Forcing,
-    moved: Float[Array, " k"],
+    moved: Float[np.ndarray, " k"],
     delta: Float[Array, "windows n"],
     sigma: Float[Array, " obs"],
-) -> tuple[Float[Array, "windows rows obs"], Float[Array, "windows kn rowsobs"]]:
+) -> tuple[Float[np.ndarray, "windows rows obs"], Float[np.ndarray, "windows kn rowsobs"]]:
     """Residuals over σ, and the derivatives of what is predicted over σ along p and the initial states."""
-    r, own, rest = _foresee(lin, rest, windowed, forcing, moved, delta, sigma)
     d = rest.slopes.shape[1] - delta.shape[-1]
-    own = jnp.pad(own, ((0, 0), (0, moved.size - d - own.shape[1]), (0, 0)))
-    return r.reshape(windowed.y.shape), jnp.concatenate([rest.slopes[:, :d], own, rest.slopes[:, d:]], 1)
+    r, own = _look_ahead(lin, windowed, forcing, moved, delta, sigma, d)
+    slopes = _read(rest, forcing.readings).slopes
+    own = np.pad(own, ((0, 0), (0, moved.size - d - own.shape[1]), (0, 0)))
+    return r.reshape(windowed.y.shape), np.concatenate([slopes[:, :d], own, slopes[:, d:]], 1)
 
 
 @trace_once(static_argnames="pieces", compiler_options=FEW_CALLS, to_numpy=True)
@@ -426,24 +437,25 @@ def bound_gains(
 
     The force is constant in so many pieces of every window; θ, the candidate's x and initial states give way to it.
     """
-    r, own, rest = _foresee(lin, rest, windowed, forcing, moved, delta, sigma)
     (count, steps, n), nv = lin.gap.shape, lin.b.shape[-1]
-    d = rest.slopes.shape[1] - n
+    d, readings = rest.slopes.shape[1] - n, forcing.readings
+    r, own = _foresee(lin, windowed, forcing, moved, delta, sigma, d)
+    scale = jnp.ones(()) if readings is None else jnp.asarray(readings.scale)
+    slopes = rest.slopes * jnp.broadcast_to(scale, windowed.y.shape).reshape(count, 1, -1)
     held = jnp.arange(steps)[:, None] * pieces // steps == jnp.arange(pieces)
     added = jnp.einsum("wtnv,tb->wtnvb", lin.b, held).reshape(count, steps, n, -1)
     seen = _see(lin, windowed, jnp.zeros((count, n, nv * pieces)), added)
-    scale = 1.0 if forcing.readings is None else forcing.readings.scale
     weight = scale * jnp.where(windowed.measured, 1.0 / sigma, 0.0)
     pushed = (seen * weight[..., None]).reshape(count, -1, nv, pieces)
     size = jnp.sqrt((pushed**2).sum((0, 1, 3)) / (count * pieces))
     pushed = pushed / jnp.maximum(size, 1e-30)[:, None]
-    shared = jnp.concatenate([rest.slopes[:, :d], own], 1)
+    shared = jnp.concatenate([slopes[:, :d], own], 1)
     point, states = p[: shared.shape[1]], delta / windowed.spread
     alike = jnp.einsum("wik,wjk->ij", shared, shared) + jnp.eye(len(point))
     pull = jnp.einsum("wik,wk->i", shared, r) - point
 
     def gain(
-        free: Float[Array, "windows m rowsobs"], prior: Float[Array, " m"], at: Float[Array, "windows m"]
+        free: Float[Numbers, "windows m rowsobs"], prior: Float[Array, " m"], at: Float[Array, "windows m"]
     ) -> Array:
         """By how much the cost falls in a step of Gauss and Newton along what is shared and what each window has."""
         alone = jnp.einsum("wik,wjk->wij", free, free) + jnp.diag(prior)
@@ -455,11 +467,11 @@ def bound_gains(
         return 0.5 * (jnp.vdot(gradient, solved[..., -1]) + slope @ jnp.linalg.solve(hessian, slope))
 
     def under(force: Float[Array, "windows rowsobs pieces"]) -> Array:
-        free = jnp.concatenate([rest.slopes[:, d:], jnp.moveaxis(force, 1, 2)], 1)
+        free = jnp.concatenate([slopes[:, d:], jnp.moveaxis(force, 1, 2)], 1)
         prior = jnp.concatenate([jnp.ones(n), jnp.full(pieces, EASY)])
         return gain(free, prior, jnp.pad(states, ((0, 0), (0, pieces))))
 
-    still = gain(rest.slopes[:, d:], jnp.ones(n), states)
+    still = gain(slopes[:, d:], jnp.ones(n), states)
     return jax.lax.map(under, jnp.moveaxis(pushed, 2, 0)) - still
 
 

@@ -84,7 +84,7 @@ class _Around:
     motion: Motion
     lin: Linearized
     windowed: Windowed
-    shared: Float[Array, "windows dn rowsobs"]
+    shared: Float[np.ndarray, "windows dn rowsobs"]
     """How readings move with θ's z and initial states."""
     weighed: dict[bytes, Rest]
     """The same over σ."""
@@ -147,7 +147,7 @@ class Scene(CandidatesOf):
 
     def assess(
         self, candidate: Candidate, p: Float[np.ndarray, " k"], delta: Float[Array, "windows n"], sigma: Array
-    ) -> tuple[Curvature, Float[Array, "windows rows obs"]]:
+    ) -> tuple[Curvature, Float[np.ndarray, "windows rows obs"]]:
         """Normal equations at a point, and residuals over σ."""
         around, forcing, moved = self._force(candidate, p)
         rest = self._weigh(around, sigma)
@@ -155,7 +155,7 @@ class Scene(CandidatesOf):
 
     def expand(
         self, candidate: Candidate, p: Float[np.ndarray, " k"], delta: Float[Array, "windows n"], sigma: Array
-    ) -> tuple[Float[Array, "windows rows obs"], Float[Array, "windows kn rowsobs"]]:
+    ) -> tuple[Float[np.ndarray, "windows rows obs"], Float[np.ndarray, "windows kn rowsobs"]]:
         """Residuals over σ at a point, and derivatives of what is predicted over σ."""
         around, forcing, moved = self._force(candidate, p)
         rest = self._weigh(around, sigma)

@@ -38,6 +38,7 @@ class Curvature:
     """Every window's part of the gradient of z."""
 
 
+@np.errstate(all="ignore")
 def normal_equations(
     r: Float[np.ndarray, "windows k"],
     slopes: Float[np.ndarray, "windows dn k"],
@@ -62,10 +63,18 @@ def normal_equations(
 def eliminate(c: Curvature, damping: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Precision of z after the δ are eliminated, its gradient, and per window own⁻¹ cross and own⁻¹ gradient."""
     own = c.own + damping * np.eye(c.own.shape[-1], dtype=c.own.dtype) * c.own.diagonal(axis1=1, axis2=2)[..., None]
-    solved = np.linalg.solve(own, np.concatenate([c.cross, c.own_gradient[..., None]], axis=-1))
+    solved = _solve(own, np.concatenate([c.cross, c.own_gradient[..., None]], axis=-1))
     toward, shift = solved[..., :-1], solved[..., -1]
     precision = c.hessian - np.tensordot(c.cross, toward, ((0, 1), (0, 1)))
     return precision, c.gradient - np.tensordot(c.cross, shift, ((0, 1), (0, 1))), toward, shift
+
+
+def _solve(a: Float[np.ndarray, "*some n n"], b: np.ndarray) -> np.ndarray:
+    """The solution of a x = b, no numbers where there is none."""
+    try:
+        return np.linalg.solve(a, b)
+    except np.linalg.LinAlgError:
+        return np.full_like(b, np.nan)
 
 
 def own_pulls(c: Curvature, shift: Float[np.ndarray, "windows n"]) -> Float[np.ndarray, "windows d"]:
@@ -81,16 +90,18 @@ def _lead(
     k = np.flatnonzero(free)
     move = np.zeros_like(gradient)
     damped = precision[np.ix_(k, k)] + damping * np.diag(c.hessian.diagonal()[k])
-    move[k] = np.linalg.solve(damped, gradient[k])
+    move[k] = _solve(damped, gradient[k])
     return move, toward, shift, gradient
 
 
+@np.errstate(all="ignore")
 def within_reach(c: Curvature, free: Bool[np.ndarray, " d"]) -> float:
     """By how much the cost falls to its least, were residuals linear and only what is `free` of z changed."""
     move, _, shift, gradient = _lead(c, 0.0, free)
     return float(0.5 * (move @ gradient + (shift * c.own_gradient).sum()))
 
 
+@np.errstate(all="ignore")
 def propose(
     c: Curvature,
     damping: float,
