@@ -15,6 +15,7 @@ from bayessim_jax.concealment.masses import link_axes
 from bayessim_jax.concealment.motions import draw_motions
 from bayessim_jax.concealment.places import driven_joint, find_joint, nearest_joint
 from bayessim_jax.concealment.world import Track, build, count_substeps, simulate
+from bayessim_jax.mechanics import free_inertia
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -194,11 +195,6 @@ def _settle(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 
 def _least_inertia(model: mujoco.MjModel, tracks: Sequence[Track], v: int) -> float:
     """The least of 1/(M⁻¹)ⱼⱼ along the motion."""
-    data, mass, least = mujoco.MjData(model), np.zeros((model.nv, model.nv)), np.inf
-    for track in tracks:
-        for k in track.rows[:: max(1, len(track.rows) // 40)]:
-            data.qpos[:] = track.qpos[k]
-            mujoco.mj_fwdPosition(model, data)
-            mujoco.mj_fullM(model, data, mass)
-            least = min(least, 1.0 / float(np.linalg.inv(mass)[v, v]))
-    return 0.8 * float(least)
+    data = mujoco.MjData(model)
+    some = (track.qpos[k] for track in tracks for k in track.rows[:: max(1, len(track.rows) // 40)])
+    return 0.8 * min(float(free_inertia(model, data, qpos)[v]) for qpos in some)

@@ -15,6 +15,7 @@ from bayessim_jax.contracts import Scalar
 from bayessim_jax.effects.contract import Number, Numbers
 from bayessim_jax.effects.places import driven_joint
 from bayessim_jax.engines.fields import Write
+from bayessim_jax.mechanics import free_inertia
 
 __all__ = [
     "CAUTION",
@@ -22,7 +23,6 @@ __all__ = [
     "actuators_of",
     "drive_of",
     "least_share",
-    "nominal_inertia",
     "probe_inertia",
     "read_numbers",
 ]
@@ -90,7 +90,7 @@ def probe_inertia(engine: Any, theta: Float[Array, " d"], qpos: Float[Array, " n
     """1/(M⁻¹)ⱼⱼ at a pose, by how much a push of one time step moves the joint from rest; no derivative is taken."""
     model, kind = engine.model, jnp.result_type(theta)
     theta = jax.lax.stop_gradient(theta)
-    push = float(nominal_inertia(model, model.qpos0, mujoco.MjData(model))[dof]) / float(model.opt.timestep)
+    push = float(free_inertia(model, mujoco.MjData(model), model.qpos0)[dof]) / float(model.opt.timestep)
     state = engine.init(theta, qpos, jnp.zeros(model.nv, kind))
     ctrl, applied = jnp.zeros(model.nu, kind), jnp.zeros(model.nv, kind)
     pushed = jnp.stack([applied, applied.at[dof].set(push)])
@@ -101,7 +101,7 @@ def probe_inertia(engine: Any, theta: Float[Array, " d"], qpos: Float[Array, " n
 def least_share(model: mujoco.MjModel, qpos: np.ndarray, dof: int) -> float:
     """How much less than at a pose a joint can feel at other poses, with some caution: a factor below 1."""
     data, random = mujoco.MjData(model), np.random.default_rng(0)
-    here = nominal_inertia(model, qpos, data)[dof]
+    here = free_inertia(model, data, qpos)[dof]
     least = here
     for _ in range(POSES):
         pose = np.array(qpos, float)
@@ -109,14 +109,5 @@ def least_share(model: mujoco.MjModel, qpos: np.ndarray, dof: int) -> float:
             if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
                 low, high = model.jnt_range[joint] if model.jnt_limited[joint] else (-np.pi, np.pi)
                 pose[model.jnt_qposadr[joint]] = random.uniform(low, high)
-        least = min(least, nominal_inertia(model, pose, data)[dof])
+        least = min(least, free_inertia(model, data, pose)[dof])
     return CAUTION * float(least / here)
-
-
-def nominal_inertia(model: mujoco.MjModel, qpos: np.ndarray, data: mujoco.MjData) -> Float[np.ndarray, " nv"]:
-    """1/(M⁻¹)ⱼⱼ of the model as it is, for every degree of freedom."""
-    data.qpos[:] = qpos
-    mujoco.mj_forward(model, data)
-    mass = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, mass)
-    return 1.0 / np.diagonal(np.linalg.inv(mass))

@@ -12,9 +12,10 @@ from bayessim_jax.contracts import System
 from bayessim_jax.effects.commanded import find_commands
 from bayessim_jax.effects.contract import Scales
 from bayessim_jax.effects.directions import link_axes
-from bayessim_jax.effects.drive import actuators_of, nominal_inertia
+from bayessim_jax.effects.drive import actuators_of
 from bayessim_jax.effects.places import at, find_body, find_site, movable_bodies
 from bayessim_jax.engines.contacts import find_partners
+from bayessim_jax.mechanics import free_inertia
 
 __all__ = ["commanded_scales", "recorded_scales"]
 
@@ -81,7 +82,7 @@ def _of_joint(model: mujoco.MjModel, joint: int, qpos: Rows, qvel: Rows, ctrl: R
         loads.append(data.qfrc_bias[dof])
         drives.append(data.qfrc_actuator[dof])
     for row in (0, len(qpos) // 2, len(qpos) - 1):
-        inertias.append(nominal_inertia(model, qpos[row], data)[dof])
+        inertias.append(free_inertia(model, data, qpos[row])[dof])
     inertia = float(np.median(inertias))
     swing = inertia * motion["speed"] ** 2 / motion["position"]
     force = max(_most(np.array(loads)), _most(np.array(drives)), swing)

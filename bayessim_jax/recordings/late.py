@@ -25,6 +25,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
 
+from bayessim_jax.mechanics import free_inertia
 from bayessim_jax.recordings.states import slopes_between
 from bayessim_jax.recordings.windows import stack_windows
 from bayessim_jax.recordings.wording import Finding
@@ -158,17 +159,13 @@ def _lags_of_held_commands(model: mujoco.MjModel, pose: Float[np.ndarray, " nq"]
     A joint follows at the rate of its damping and its servos' over the inertia that it shows while others are free;
     what nothing drives, or drives through a state of its own, does not jump.
     """
-    data, dampings, jumps = mujoco.MjData(model), model.dof_damping.copy(), np.zeros(model.nv, bool)
-    data.qpos[:] = pose
-    mujoco.mj_fwdPosition(model, data)
-    mobility = np.zeros((model.nv, model.nv))
-    mujoco.mj_solveM(model, data, mobility, np.eye(model.nv))
+    dampings, jumps = model.dof_damping.copy(), np.zeros(model.nv, bool)
     for i in range(model.nu):
         if model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT:
             v = model.jnt_dofadr[model.actuator_trnid[i, 0]]
             dampings[v] -= model.actuator_gear[i, 0] ** 2 * model.actuator_biasprm[i, 2]
             jumps[v] |= model.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_NONE
-    passed = np.maximum(row * dampings * np.diag(mobility), 1e-2)
+    passed = np.maximum(row * dampings / free_inertia(model, mujoco.MjData(model), pose), 1e-2)
     return np.where(jumps, row * (1.0 / -np.expm1(-passed) - 1.0 / passed - 0.5), 0.0)
 
 
