@@ -168,8 +168,9 @@ def expand(
     look informed, and forward ones along δ, which move far less than a simulator bends. Where it is not smooth all are
     central, of length `step`. The point and those beside it are simulated by one loop or as one batch: the compiler
     meets a simulator once, where forward-mode derivatives of it make a program several times as large
-    (`docs/architecture.md`). Of z only the first `live` matter to the simulator, all unless told. With the point
-    `alone` slopes need not be right.
+    (`docs/architecture.md`). A simulator that is not smooth is MuJoCo's C engine, which takes batches and is not
+    compiled. Of z only the first `live` matter to the simulator, all unless told. With the point `alone` slopes need
+    not be right.
     """
     d, n, windows = z.size if live is None else live, delta.shape[-1], delta.shape[0]
     still = jnp.zeros(z.size - d, z.dtype)
@@ -180,10 +181,14 @@ def expand(
     # points outside and windows inside: z is common to all windows, and theirs lie side by side
     moved = lambda way: z + jnp.concatenate([way[:d], still])  # noqa: E731
     run = lambda way: predict_all(predict, shots, moved(way), delta + way[d:] * shots.spread)  # noqa: E731
-    if jax.default_backend() == "cpu" and windows >= MANY:
-        runs = jnp.where(alone, 1, count) if isinstance(alone, Array) else count
-        nothing = jnp.zeros((count, *shots.y.shape), jnp.result_type(z, shots.y))
-        y = jax.lax.fori_loop(0, runs, lambda k, y: y.at[k].set(run(ways[k])), nothing)
+    nothing = jnp.zeros((count, *shots.y.shape), jnp.result_type(z, shots.y))
+    put = lambda k, y: y.at[k].set(run(ways[k]))  # noqa: E731
+    asked = isinstance(alone, Array)
+    if step:
+        every = lambda: jax.vmap(run)(ways)  # noqa: E731
+        y = jax.lax.cond(alone, lambda: put(0, nothing), every) if asked else every()
+    elif jax.default_backend() == "cpu" and windows >= MANY:
+        y = jax.lax.fori_loop(0, jnp.where(alone, 1, count) if asked else count, put, nothing)
     else:
         y = jax.vmap(run)(ways)
     value, ahead, behind = y[0], y[1 : 1 + d + n], y[1 + d + n :]
