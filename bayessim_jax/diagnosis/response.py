@@ -168,9 +168,10 @@ def _miss(engine: Any, substeps: int, row: tuple[Array, ...], move: Array, force
 
 def _miss_all(engine: Any, substeps: int, motion: Motion, move: Array, force: Array, inner: Array) -> Array:
     """The same of every row of every window."""
-    rows = [x.reshape(-1, x.shape[-1]) for x in _rows(motion)]
+    windows, steps, _ = motion.ctrl.shape
+    rows = [x.reshape(windows * steps, x.shape[-1]) for x in _rows(motion)]
     found = map_in_blocks(lambda *row: _miss(engine, substeps, row, move, force, inner), *rows)
-    return found.reshape(*motion.ctrl.shape[:2], -1)
+    return found.reshape(windows, steps, 2 * engine.model.nv)
 
 
 @struct.dataclass

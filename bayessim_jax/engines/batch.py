@@ -83,13 +83,14 @@ def _in_blocks(function: Callable[..., Any], *batch: Any, axes: Any, block: int)
     size = jax.tree.leaves(batch)[0].shape[0]
     if block == size:
         return function(*batch)
-    cut = jax.tree.map(lambda x: x.reshape(-1, block, *x.shape[1:]), batch)
+    # of what is empty, such as the commands of a machine without motors, no size can be left to be inferred
+    cut = jax.tree.map(lambda x: x.reshape(size // block, block, *x.shape[1:]), batch)
     found = jax.lax.map(lambda one: function(*one), cut)
     return jax.tree.map(lambda x, k: _joined(jnp.moveaxis(x, 0, k), k), found, axes)
 
 
 def _joined(x: Array, axis: int) -> Array:
-    return x.reshape(*x.shape[:axis], -1, *x.shape[axis + 2 :])
+    return x.reshape(*x.shape[:axis], x.shape[axis] * x.shape[axis + 1], *x.shape[axis + 2 :])
 
 
 def _solves(jaxpr: Any) -> bool:

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_jax.engines.batch import compile_batched, compile_spread, forward_jacobians
+from bayessim_jax.engines.batch import compile_batched, compile_spread, forward_jacobians, map_in_blocks
 from bayessim_jax.engines.fields import find_writes, merge_writes
 from bayessim_jax.engines.tree import TreeEngine
 from tests.engines.mechanisms import MODELS
@@ -48,3 +48,11 @@ def test_jacobians_of_a_batch_are_those_of_each(last):
     np.testing.assert_allclose(values, jax.jit(jax.vmap(last))(THETAS), rtol=1e-5, atol=1e-6)
     each = jax.jit(jax.vmap(jax.jacfwd(last)))(THETAS)
     np.testing.assert_allclose(jnp.moveaxis(tangents, 0, -1), each, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [7, 90, 1230])
+def test_blocks_are_the_whole_of_what_is_traced(size):
+    """Also where there is nothing in a row, such as commands of a machine without motors."""
+    x, none = jnp.arange(3.0 * size).reshape(size, 3), jnp.zeros((size, 0))
+    found = jax.jit(lambda *rows: map_in_blocks(lambda a, b: jnp.append(a * 2.0, b.sum()), *rows))(x, none)
+    np.testing.assert_array_equal(found, jnp.pad(2.0 * x, ((0, 0), (0, 1))))
