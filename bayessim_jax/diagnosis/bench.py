@@ -282,8 +282,8 @@ class Bench:
         `known` is its fit to the same windows that ended there.
         """
         own = self.setup(candidate)
-        delta = jnp.pad(delta, ((0, 0), (0, own.spread.size - delta.shape[-1])))
-        start, how = (x, delta, sigma, self.free(candidate)), {"steps": steps, "step": self.step, "damping": damping}
+        states = np.pad(np.asarray(delta), ((0, 0), (0, own.spread.size - delta.shape[-1])))
+        start, how = (x, states, sigma, self.free(candidate)), {"steps": steps, "step": self.step, "damping": damping}
         return solve(self.simulator(candidate), own, *start, **how, live=self.used(candidate), known=known)
 
     def traded(self, candidate: Candidate, x: Float[Array, " k"]) -> list[Float[Array, " k"]]:

@@ -23,7 +23,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from bayessim_jax.engines.batch import map_in_blocks
-from bayessim_jax.inference.arrow import Curvature
+from bayessim_jax.inference.arrow import Curvature, cost_of
 from bayessim_jax.inference.shooting import COMPILER_OPTIONS, FEW_CALLS
 from bayessim_jax.programs import trace_once
 from bayessim_jax.systems.mjcf import displace
@@ -360,7 +360,7 @@ def _foresee(
     return r, jnp.moveaxis((own * weight[..., None]).reshape(count, -1, e), 1, 2)
 
 
-_look_ahead = trace_once(_foresee, static_argnames="d", compiler_options=COMPILER_OPTIONS, to_numpy=True)
+_foreseen = trace_once(_foresee, static_argnames="d", compiler_options=COMPILER_OPTIONS, to_numpy=True)
 
 
 @np.errstate(all="ignore")
@@ -381,7 +381,7 @@ def assess(
     """
     (windows, n), scaled = delta.shape, np.asarray(delta) / np.asarray(windowed.spread)
     d = rest.slopes.shape[1] - n
-    r, own = _look_ahead(lin, windowed, forcing, moved, delta, sigma, d)
+    r, own = _foreseen(lin, windowed, forcing, moved, delta, sigma, d)
     rest = _read(rest, forcing.readings)
     both = np.concatenate([own, r[:, None]], 1).swapaxes(1, 2)
     along_rest, along_own = rest.slopes @ both, own @ both
@@ -394,7 +394,7 @@ def assess(
     hessian[d:k, d:k] += along_own[..., :-1].sum(0)
     pulls = np.concatenate([pull[:, :d], along_own[..., -1], np.zeros((windows, room))], 1)
     curvature = Curvature(
-        cost=0.5 * float((r**2).sum() + p @ p + (scaled**2).sum()),
+        cost=cost_of(r, p, scaled),
         hessian=hessian,
         gradient=pulls.sum(0) - p,
         own=rest.products[:, d:, d:] + np.eye(n),
@@ -416,7 +416,7 @@ def expand_response(
 ) -> tuple[Float[np.ndarray, "windows rows obs"], Float[np.ndarray, "windows kn rowsobs"]]:
     """Residuals over σ, and the derivatives of what is predicted over σ along p and the initial states."""
     d = rest.slopes.shape[1] - delta.shape[-1]
-    r, own = _look_ahead(lin, windowed, forcing, moved, delta, sigma, d)
+    r, own = _foreseen(lin, windowed, forcing, moved, delta, sigma, d)
     slopes = _read(rest, forcing.readings).slopes
     own = np.pad(own, ((0, 0), (0, moved.size - d - own.shape[1]), (0, 0)))
     return r.reshape(windowed.y.shape), np.concatenate([slopes[:, :d], own, slopes[:, d:]], 1)

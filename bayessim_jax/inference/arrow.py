@@ -13,9 +13,7 @@ from flax import struct
 from jaxtyping import Bool, Float
 from scipy.special import ndtr, ndtri
 
-from bayessim_jax.contracts import Scalar
-
-__all__ = ["Curvature", "eliminate", "normal_equations", "own_pulls", "propose", "stride", "within_reach"]
+__all__ = ["Curvature", "cost_of", "eliminate", "normal_equations", "own_pulls", "propose", "stride", "within_reach"]
 
 OUTERMOST = 1e-4
 """Share of an interval at either end into which no step from the other one leads."""
@@ -25,8 +23,8 @@ OUTERMOST = 1e-4
 class Curvature:
     """The normal equations of all windows at one point, the initial states eliminated one by one."""
 
-    cost: Scalar | float
-    """½ (Σ residuals² + zᵀz + Σ δᵀS⁻²δ)."""
+    cost: float
+    """`cost_of` it."""
     hessian: Float[np.ndarray, "d d"]
     """Of z, with z's prior."""
     gradient: Float[np.ndarray, " d"]
@@ -38,6 +36,11 @@ class Curvature:
     """Every window's part of the gradient of z."""
 
 
+def cost_of(r: np.ndarray, own: Float[np.ndarray, " d"], scaled: Float[np.ndarray, "windows n"]) -> float:
+    """½ (Σ r² + zᵀz + Σ δᵀS⁻²δ), where `own` and `scaled` are z and δ/S less their priors' means."""
+    return float(0.5 * ((r**2).sum() + own @ own + (scaled**2).sum()))
+
+
 @np.errstate(all="ignore")
 def normal_equations(
     r: Float[np.ndarray, "windows k"],
@@ -45,12 +48,12 @@ def normal_equations(
     own: Float[np.ndarray, " d"],
     scaled: Float[np.ndarray, "windows n"],
 ) -> Curvature:
-    """Of residuals and slopes as `expand` gives them; `own` and `scaled` are z and δ/S less their priors' means."""
+    """Of residuals and slopes as `expand` gives them; `own` and `scaled` as in `cost_of`."""
     d, n = own.size, scaled.shape[-1]
     products = slopes @ slopes.swapaxes(1, 2)
     pulls = (slopes @ r[..., None])[..., 0]
     return Curvature(
-        cost=0.5 * ((r**2).sum() + own @ own + (scaled**2).sum()),
+        cost=cost_of(r, own, scaled),
         hessian=products[:, :d, :d].sum(0) + np.eye(d, dtype=own.dtype),
         gradient=pulls[:, :d].sum(0) - own,
         own=products[:, d:, d:] + np.eye(n, dtype=own.dtype),
@@ -94,11 +97,14 @@ def _lead(
     return move, toward, shift, gradient
 
 
-@np.errstate(all="ignore")
 def within_reach(c: Curvature, free: Bool[np.ndarray, " d"]) -> float:
-    """By how much the cost falls to its least, were residuals linear and only what is `free` of z changed."""
+    """By how much the cost falls to its least, were residuals linear and only what is `free` of z changed.
+
+    Infinite where something is not finite.
+    """
     move, _, shift, gradient = _lead(c, 0.0, free)
-    return float(0.5 * (move @ gradient + (shift * c.own_gradient).sum()))
+    fall = float(0.5 * (move @ gradient + (shift * c.own_gradient).sum()))
+    return fall if np.isfinite(fall) and np.isfinite(c.cost) else np.inf
 
 
 @np.errstate(all="ignore")

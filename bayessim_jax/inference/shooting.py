@@ -27,7 +27,15 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from bayessim_jax.contracts import Scalar
 from bayessim_jax.engines.batch import TASKS, WIDE
-from bayessim_jax.inference.arrow import Curvature, eliminate, normal_equations, own_pulls, propose, within_reach
+from bayessim_jax.inference.arrow import (
+    Curvature,
+    cost_of,
+    eliminate,
+    normal_equations,
+    own_pulls,
+    propose,
+    within_reach,
+)
 from bayessim_jax.programs import trace_once
 
 __all__ = [
@@ -183,12 +191,10 @@ def expand(
     run = lambda way: predict_all(predict, shots, moved(way), delta + way[d:] * shots.spread)  # noqa: E731
     nothing = jnp.zeros((count, *shots.y.shape), jnp.result_type(z, shots.y))
     put = lambda k, y: y.at[k].set(run(ways[k]))  # noqa: E731
-    asked = isinstance(alone, Array)
     if step:
-        every = lambda: jax.vmap(run)(ways)  # noqa: E731
-        y = jax.lax.cond(alone, lambda: put(0, nothing), every) if asked else every()
+        y = jax.lax.cond(alone, lambda: put(0, nothing), lambda: jax.vmap(run)(ways))
     elif jax.default_backend() == "cpu" and windows >= MANY:
-        y = jax.lax.fori_loop(0, jnp.where(alone, 1, count) if asked else count, put, nothing)
+        y = jax.lax.fori_loop(0, jnp.where(alone, 1, count), put, nothing)
     else:
         y = jax.vmap(run)(ways)
     value, ahead, behind = y[0], y[1 : 1 + d + n], y[1 + d + n :]
@@ -229,7 +235,7 @@ class _Point:
     slopes: Float[np.ndarray, "windows dn k"]
     curvature: Curvature
     left: float
-    """By how much the cost falls to its least, were residuals linear; infinite where something is not finite."""
+    """`within_reach`: infinite where something is not finite."""
 
 
 class _Problem:
@@ -248,15 +254,13 @@ class _Problem:
 
     def cost(self, z: np.ndarray, delta: np.ndarray) -> float:
         """What is made least."""
-        r, own, scaled = self.look(z, delta, alone=True)[0], z - self.center, (delta - self.shift) / self.spread
-        return float(0.5 * ((r**2).sum() + own @ own + (scaled**2).sum()))
+        return cost_of(self.look(z, delta, alone=True)[0], z - self.center, (delta - self.shift) / self.spread)
 
     def at(self, z: np.ndarray, delta: np.ndarray, seen: tuple[np.ndarray, np.ndarray] | None = None) -> _Point:
         """A point; what is `seen` there is simulated unless told."""
         r, slopes = self.look(z, delta) if seen is None else seen
         curvature = normal_equations(r, slopes, z - self.center, (delta - self.shift) / self.spread)
-        sound = all(np.isfinite(x).all() for x in (curvature.cost, curvature.hessian, curvature.gradient))
-        return _Point(z, delta, r, slopes, curvature, within_reach(curvature, self.free) if sound else np.inf)
+        return _Point(z, delta, r, slopes, curvature, within_reach(curvature, self.free))
 
     def propose(self, point: _Point, damping: float) -> tuple[np.ndarray, np.ndarray, float]:
         """Where a damped step leads, and by how much the cost should fall."""
@@ -279,7 +283,7 @@ class _Problem:
             "precision": np.where(np.outer(held, held), precision, np.eye(held.size, dtype=point.z.dtype)),
             "pulls": np.where(held, pulls, 0.0),
             "r": point.r.reshape(self.shots.y.shape),
-            "cost": c.cost if known else np.asarray(np.inf, point.z.dtype),
+            "cost": c.cost if known else np.inf,
             "z": point.z,
             "delta": point.delta,
             "sigma": self.sigma,
@@ -327,7 +331,7 @@ def solve(
         while count < steps and SETTLED <= point.left < np.inf and small < 2 and damping < STUCK:
             count += 1
             to, moved, promised = problem.propose(point, damping)
-            cost = float(point.curvature.cost)
+            cost = point.curvature.cost
             fall = cost - problem.cost(to, moved)
             there = problem.at(to, moved) if fall >= 0.0 else None
             # where a simulation ends well those beside it may not

@@ -210,18 +210,20 @@ def test_a_fit_that_is_known_is_not_simulated_again(monkeypatch):
     np.testing.assert_allclose(other.z, exact(shots, 2.0 * SIGMA)[0], atol=1e-6)
 
 
-def test_a_simulator_that_ends_where_those_beside_it_do_not_is_no_place_to_stop():
-    """sqrt has no derivative from below at 0, where a step of the linear one leads."""
-
-    def rooted(z, delta, window):
-        return line(jnp.array([1.0, 0.0]) * jnp.sqrt(z[0] + 1.0), delta, window)
-
+def test_a_point_beside_which_simulations_fail_is_refused():
+    """Where the first step leads the simulation ends well, and a little further on it does not."""
     shots, _ = line_data(9)
-    given = jnp.zeros((WINDOWS, 1)), jnp.array([SIGMA])
-    broken = solve(rooted, shots, jnp.array([-2.0, 0.0]), *given, np.ones(2, bool))
-    assert not np.isfinite(broken.cost) and not broken.converged
-    fit = solve(rooted, shots, jnp.array([-1.0 + 1e-5, 0.0]), *given, np.ones(2, bool))
-    assert np.isfinite(fit.cost) and np.isfinite(fit.precision).all() and fit.z[0] > -1.0
+    given = jnp.zeros(2), jnp.zeros((WINDOWS, 1)), jnp.array([SIGMA]), np.ones(2, bool)
+    led = float(solve(line, shots, *given, steps=2, damping=1.0).z[0])
+
+    def broken(z, delta, window):
+        return jnp.where(z[0] > led + 1e-7, jnp.nan, line(z, delta, window))
+
+    assert led > 0.0
+    fit = solve(broken, shots, *given, damping=1.0)
+    assert np.isfinite(fit.cost) and np.isfinite(fit.precision).all() and 0.0 < fit.z[0] < led
+    nowhere = solve(broken, shots, jnp.array([led + 1.0, 0.0]), *given[1:])
+    assert not np.isfinite(nowhere.cost) and not nowhere.converged
 
 
 def test_parameters_that_are_not_free_stay():
