@@ -19,7 +19,8 @@ from bayessim_jax.diagnosis.bench import Bench, Candidate
 from bayessim_jax.diagnosis.experiment import Experiment
 from bayessim_jax.diagnosis.flexible import FEATURES, FLEXIBLE, UNITS, features
 from bayessim_jax.diagnosis.locate import Location, find_regime, find_windows_of, shares_from_left
-from bayessim_jax.diagnosis.procedure import Problem, detect, is_hidden, is_mismatch, name_effects
+from bayessim_jax.diagnosis.problem import Problem
+from bayessim_jax.diagnosis.procedure import detect, is_hidden, is_mismatch, name_effects
 from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.diagnosis.screen import Screened
 from bayessim_jax.diagnosis.simulated_scene import SimulatedScene

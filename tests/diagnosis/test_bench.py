@@ -9,19 +9,18 @@ import numpy as np
 import pytest
 
 from bayessim_jax.diagnosis.bench import Candidate, margin_of_effect
-from bayessim_jax.diagnosis.procedure import (
-    Problem,
+from bayessim_jax.diagnosis.finals import (
     _folds,
     _foresee,
     _log_share,
     _stand_ins,
-    _turn,
-    _varied,
     _with_numbers_of,
-    detect,
 )
+from bayessim_jax.diagnosis.problem import Problem
+from bayessim_jax.diagnosis.procedure import detect
 from bayessim_jax.diagnosis.response import Motion
 from bayessim_jax.diagnosis.screen import Begun
+from bayessim_jax.diagnosis.search import _turn, varied
 from bayessim_jax.diagnosis.verdict import error_left
 from bayessim_jax.effects import EFFECTS, EffectParameter, Scales
 from bayessim_jax.inference.arrow import normal_equations
@@ -381,9 +380,9 @@ def test_pairs_that_are_simulated_differ_in_their_effects():
 
     best = [found(100.0, 0, 1), found(99.0, 1, 2), found(98.0, 0, 2), found(97.0, 2, 3)]
     others = [found(96.0, 0, 3), found(95.0, 1, 4), found(94.0, 2, 4), found(93.0, 3, 4), found(10.0, 0, 5)]
-    assert _varied([*best, *others], 0.0) == [*best, *others[1:3]]
-    assert _varied([*best, *others], 79.0) == [*best, others[1]]
-    assert _varied(best[:2], 0.0) == best[:2]
+    assert varied([*best, *others], 0.0) == [*best, *others[1:3]]
+    assert varied([*best, *others], 79.0) == [*best, others[1]]
+    assert varied(best[:2], 0.0) == best[:2]
 
 
 @pytest.mark.parametrize(("z", "low", "share"), [(0.0, -1.0, 0.0), (1.0, -1.0, -5.105), (0.3, 0.01, -4.65)])

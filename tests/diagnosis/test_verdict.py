@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from bayessim_jax.diagnosis.bench import Candidate
-from bayessim_jax.diagnosis.procedure import _is_too_narrow, _recall
+from bayessim_jax.diagnosis.finals import _recall
+from bayessim_jax.diagnosis.procedure import _is_too_narrow
 from bayessim_jax.diagnosis.verdict import (
     Entry,
     Thresholds,
