@@ -82,7 +82,7 @@ class Linearized:
     gap: Float[Array, "windows steps n"]
     """F(x̄_t, u_t; θ) − x̄_{t+1}."""
     heavier: Float[Array, "windows steps d nv nv"] | None = None
-    """W in b(θ + Δ) = b(θ) (I + Σ Δ_j W_j)⁻¹: what withstands forces grows linearly with masses."""
+    """∂(b_v⁻¹)/∂θ_j, with b_v the rows of b that are velocities: what withstands forces grows linearly with masses."""
 
 
 @struct.dataclass
@@ -254,7 +254,8 @@ def move_steps(
     nv = engine.model.nv
     gap = _miss_all(engine, substeps, motion, jnp.zeros(2 * nv), jnp.zeros(nv), numbers(x))
     if heavier is not None:
-        b = _divide(b, jnp.eye(nv) + jnp.einsum("wtdij,d->wtij", heavier, shift))
+        grown = jnp.einsum("wtdij,d->wtij", heavier, shift)
+        b = _divide(b, jnp.eye(nv) + jnp.einsum("wtij,wtjk->wtik", grown, b[..., nv:, :]))
     return gap, b, (jnp.diagonal(b[..., nv:, :], axis1=-2, axis2=-1) > 0.0).all()
 
 
@@ -281,7 +282,7 @@ def find_heavier(
     nv = len(width)
     there = (gaps[:, 1 : nv + 1] - gaps[:, :1]) / width[:, None, None, None]
     there = jnp.transpose(there[..., nv:], (2, 3, 0, 4, 1))
-    found = (jnp.linalg.solve(there, lin.b[..., None, nv:, :]) - jnp.eye(nv)) / by[:, None, None]
+    found = (jnp.linalg.inv(there) - jnp.linalg.inv(lin.b[..., None, nv:, :])) / by[:, None, None]
     return jnp.where(jnp.isfinite(found), found, 0.0)
 
 

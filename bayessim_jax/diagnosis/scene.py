@@ -128,6 +128,7 @@ class Scene(CandidatesOf):
         self._homes: dict[Any, _Around] = {}
         self._base: _Around | None = None
         self._recent: _Around | None = None
+        self._heavier: Array | None = None
         self._kept: dict[Any, Any] = {}
 
     def twin(self) -> Scene:
@@ -284,7 +285,9 @@ class Scene(CandidatesOf):
             gaps = self._find_gaps(motion, beside, count)
             lin = differ(base.lin if base else None, gaps, ways, forced, self.step > 0.0)
         if base is None and self.d:
-            lin = dataclasses.replace(lin, heavier=self._find_heavier(candidate, p, motion, lin))
+            if self._heavier is None:
+                self._heavier = self._find_heavier(candidate, p, motion, lin)
+            lin = dataclasses.replace(lin, heavier=self._heavier)
         kept, windowed = np.where(self._steps(candidate), p, 0.0), self._windowed(p, motion)
         shared, weighed = (base.shared, base.weighed) if base else (respond(lin, windowed, self.d), {})
         return _Around(self._edits(candidate), kept, motion, lin, windowed, shared, weighed)
@@ -337,7 +340,11 @@ class Scene(CandidatesOf):
         return self.length / (self.system.dt * np.maximum(self.model.dof_invweight0, 1e-12))
 
     def _find_heavier(self, candidate: Candidate, p: Float[np.ndarray, " k"], motion: Motion, lin: Linearized) -> Array:
-        """How what withstands forces grows with θ, from where each by itself is at or towards its usual value."""
+        """How what withstands forces grows with θ, from where each by itself is at or towards its usual value.
+
+        The same at every θ where it is linear in that, as in masses, and along motions that are near, as those are that
+        sensors distort.
+        """
         nv, every, by = self.model.nv, [], []
         for j in range(self.d):
             away = np.copysign(max(AWAY, abs(p[j])), p[j])

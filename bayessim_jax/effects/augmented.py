@@ -25,7 +25,7 @@ from bayessim_jax.effects.commands import (
     warm_up,
 )
 from bayessim_jax.effects.contract import Numbers
-from bayessim_jax.effects.drive import probe_inertia, read_numbers
+from bayessim_jax.effects.drive import read_numbers
 from bayessim_jax.effects.forces import add_forces, begin_joints, recall_motion
 from bayessim_jax.effects.readings import begin_late, distort, restore, restore_motion, sensors, track
 from bayessim_jax.effects.rig import AugmentedState, Grip, Rig
@@ -150,8 +150,9 @@ class AugmentedMjcf:
         numbers, inner = self._prepare(theta)
         held = action if past is None or not len(past) else jnp.asarray(past[0], kind)
         physics = self.engine.init(inner, qpos, qvel)
+        at_rest = jax.lax.stop_gradient(inner)
         inertias = {
-            joint: share * probe_inertia(self.engine, inner, self.base.qpos.astype(kind), rig.address(joint)[1])
+            joint: share * self.engine.inertia(at_rest, self.base.qpos, rig.address(joint)[1])
             for joint, share in self.shares
         }
         grips = tuple(Grip(qvel[rig.address(j)[1]], jnp.zeros((), kind), m) for j, m in inertias.items())

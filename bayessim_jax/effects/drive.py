@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from bayessim_jax.contracts import Scalar
 from bayessim_jax.effects.contract import Number, Numbers
 from bayessim_jax.effects.places import driven_joint
 from bayessim_jax.engines.fields import Write
@@ -23,7 +21,6 @@ __all__ = [
     "actuators_of",
     "drive_of",
     "least_share",
-    "probe_inertia",
     "read_numbers",
 ]
 
@@ -84,18 +81,6 @@ def drive_of(
 def actuators_of(model: mujoco.MjModel, joint: int) -> list[int]:
     """The actuators that drive a joint."""
     return [i for i in range(model.nu) if driven_joint(model, i) == joint]
-
-
-def probe_inertia(engine: Any, theta: Float[Array, " d"], qpos: Float[Array, " nq"], dof: int) -> Scalar:
-    """1/(M⁻¹)ⱼⱼ at a pose, by how much a push of one time step moves the joint from rest; no derivative is taken."""
-    model, kind = engine.model, jnp.result_type(theta)
-    theta = jax.lax.stop_gradient(theta)
-    push = float(free_inertia(model, mujoco.MjData(model), model.qpos0)[dof]) / float(model.opt.timestep)
-    state = engine.init(theta, qpos, jnp.zeros(model.nv, kind))
-    ctrl, applied = jnp.zeros(model.nu, kind), jnp.zeros(model.nv, kind)
-    pushed = jnp.stack([applied, applied.at[dof].set(push)])
-    still, moved = jax.vmap(lambda f: engine.qvel(engine.step(theta, state, ctrl, f))[dof])(pushed)
-    return push * float(model.opt.timestep) / (moved - still)
 
 
 def least_share(model: mujoco.MjModel, qpos: np.ndarray, dof: int) -> float:

@@ -7,6 +7,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 import mujoco
 from jaxtyping import Array, Float
 
+from bayessim_jax.contracts import Scalar
 from bayessim_jax.engines.fields import Write
 
 __all__ = ["Engine"]
@@ -64,4 +65,8 @@ class Engine(Protocol[S]):
 
     def sensors(self, theta: Float[Array, " d"], state: S, ctrl: Float[Array, " nu"]) -> Float[Array, " ns"]:
         """`sensordata` in a state, under a control; engines without sensors raise `NotImplementedError`."""
+        ...
+
+    def inertia(self, theta: Float[Array, " d"], qpos: Float[Array, " nq"], dof: int) -> Scalar:
+        """1/(M⁻¹)ⱼⱼ at a pose (kg or kg m²): what a degree of freedom shows of inertia while the others are free."""
         ...

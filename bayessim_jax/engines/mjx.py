@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from bayessim_jax.contracts import Scalar
 from bayessim_jax.engines.fields import Write
+from bayessim_jax.engines.probe import probe_inertia
 
 __all__ = ["MjxEngine", "MjxState"]
 
@@ -100,6 +101,10 @@ class MjxEngine:
         """`sensordata` in a state, under a control."""
         model = self._write(theta)
         return self.mjx.forward(model, self._data(model, state, ctrl, None)).sensordata
+
+    def inertia(self, theta: Float[Array, " d"], qpos: Float[Array, " nq"], dof: int) -> Scalar:
+        """1/(M⁻¹)ⱼⱼ at a pose, from a step."""
+        return probe_inertia(self, theta, qpos, dof)
 
     def _data(self, model: Any, state: MjxState, ctrl: Array, applied: Array | None) -> Any:
         fields = {

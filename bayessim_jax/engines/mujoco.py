@@ -18,8 +18,10 @@ from flax import struct
 from jaxtyping import Array, Float, UInt32
 from mujoco import rollout
 
+from bayessim_jax.contracts import Scalar
 from bayessim_jax.engines.fields import Write
 from bayessim_jax.engines.models import ModelBank
+from bayessim_jax.engines.probe import probe_inertia
 
 __all__ = ["MujocoEngine", "MujocoState", "count_cores"]
 
@@ -155,6 +157,10 @@ class MujocoEngine:
         """`sensordata` in a state, under a control."""
         shape = jax.ShapeDtypeStruct((self.model.nsensordata,), state.qpos.dtype)
         return jax.pure_callback(self._sense, shape, theta, state.physics, ctrl, vmap_method="broadcast_all")
+
+    def inertia(self, theta: Float[Array, " d"], qpos: Float[Array, " nq"], dof: int) -> Scalar:
+        """1/(M⁻¹)ⱼⱼ at a pose, from a step."""
+        return probe_inertia(self, theta, qpos, dof)
 
     def _begin(self, qpos: Any, qvel: Any) -> np.ndarray:
         qpos, qvel = np.asarray(qpos), np.asarray(qvel)

@@ -167,7 +167,10 @@ def test_what_forces_do_is_known_where_masses_are_far_from_those_of_before():
     np.testing.assert_allclose(b, there.b, atol=5e-3 * size)
     np.testing.assert_allclose(gap, there.gap, atol=1e-12)
     assert gives_way
-    assert not move_steps(arm.engine, _same, motion, theta, -here.b, here.heavier, shift, 2)[2]
+    assert not move_steps(arm.engine, _same, motion, theta, here.b, here.heavier, -10.0 * shift, 2)[2]
+    # also from elsewhere
+    _, b, _ = move_steps(arm.engine, _same, motion, np.array([0.3, 0.1]), there.b, here.heavier, -shift, 2)
+    np.testing.assert_allclose(b, here.b, atol=5e-3 * np.abs(here.b).max())
 
 
 @pytest.mark.parametrize("joint", [0, 1])

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from bayessim_jax.engines.contract import Engine
+from bayessim_jax.engines.fields import Write
 from bayessim_jax.engines.mjx import MjxEngine
 from bayessim_jax.engines.mujoco import MujocoEngine
 from bayessim_jax.engines.tree import TreeEngine
+from bayessim_jax.mechanics import free_inertia
 from tests.engines.mechanisms import HOPPER, MODELS
 
 STEPS = 100
@@ -178,3 +180,28 @@ def test_sensors_of_the_c_engine():
     mujoco.mj_forward(model, data)
     np.testing.assert_array_equal(seen[0], data.sensordata.astype(np.float32))
     assert seen[1, 0] != seen[0, 0], "an accelerometer feels the control"
+
+
+@pytest.mark.parametrize("name", ["cart_pole", "spatial_arm", "springs"])
+def test_engines_know_what_a_joint_shows_of_inertia(name):
+    """As MuJoCo's own mass matrix has it; a step that is damped shows as much more as damping does within it."""
+    with jax.enable_x64():
+        model = mujoco.MjModel.from_xml_string(MODELS[name])
+        pose = model.qpos0 + np.linspace(-0.8, 0.6, model.nq)
+        theirs = free_inertia(model, mujoco.MjData(model), pose)
+        tree, stepped = TreeEngine(model), MujocoEngine(model, threads=2)
+        theta = jnp.zeros(0)
+        for dof in range(model.nv):
+            here = [tree.inertia(theta, pose, dof), jax.jit(tree.inertia, static_argnums=2)(theta, pose, dof)]
+            np.testing.assert_allclose(here, theirs[dof], rtol=1e-9)
+            assert stepped.inertia(theta, pose, dof) == pytest.approx(theirs[dof], rel=0.1)
+
+
+def test_what_a_joint_shows_of_inertia_follows_theta():
+    with jax.enable_x64():
+        model = mujoco.MjModel.from_xml_string(MODELS["cart_pole"])
+        heavier = mujoco.MjModel.from_xml_string(MODELS["cart_pole"])
+        heavier.body_mass[2] = 2.5
+        engine = TreeEngine(model, (Write("body_mass", (2,), 1.0, 0),))
+        shown = jax.jit(lambda theta: engine.inertia(theta, model.qpos0, 0))(jnp.array([2.5]))
+        assert shown == pytest.approx(free_inertia(heavier, mujoco.MjData(heavier), model.qpos0)[0], rel=1e-9)

@@ -11,13 +11,16 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from flax import struct
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from bayessim_jax.contracts import Scalar
 from bayessim_jax.engines.fields import Write
+from bayessim_jax.engines.tree.dynamics import mass_matrix, place_links
 from bayessim_jax.engines.tree.folding import Folded, fold, settle
 from bayessim_jax.engines.tree.integrate import advance
 from bayessim_jax.engines.tree.prepare import prepare
+from bayessim_jax.engines.tree.solve import add_to_diagonal, solve
 from bayessim_jax.engines.tree.support import find_refusals
 
 __all__ = ["TreeEngine", "TreeState"]
@@ -111,6 +114,16 @@ class TreeEngine:
         """The tree engine has no sensors but the joints' positions and velocities."""
         raise NotImplementedError("the tree engine has no sensors; observe joints, or take the mujoco engine.")
 
+    def inertia(self, theta: Float[Array, " d"], qpos: Float[Array, " nq"], dof: int) -> Scalar:
+        """1/(M⁻¹)ⱼⱼ at a pose, of which what is known while tracing never reaches the compiler."""
+        kind = jnp.result_type(theta)
+        tree = prepare(self.model, self.writes, [theta[k] for k in range(theta.shape[0])])
+        traced = isinstance(qpos, Tracer)
+        pose = _split(qpos, self.model.nq, kind) if traced else np.asarray(qpos).tolist()
+        matrix = add_to_diagonal(mass_matrix(tree.links, place_links(tree.links, _fold_all(pose))), tree.armature)
+        inverse = solve(matrix, [fold(float(i == dof)) for i in range(self.model.nv)])
+        return jnp.asarray((1.0 / inverse[dof]).value, kind)
+
     def _prepare(self, theta: Float[Array, " d"]) -> Step:
         """One time step with θ written in; what depends on θ alone is computed outside of loops."""
         tree = prepare(self.model, self.writes, [theta[k] for k in range(theta.shape[0])])
@@ -132,7 +145,7 @@ def _repeat(
     return jax.lax.scan(lambda s, _: (once(s, ctrl, applied), None), state, length=steps)[0]
 
 
-def _fold_all(values: Sequence[Scalar]) -> list[Folded]:
+def _fold_all(values: Sequence[Scalar | float]) -> list[Folded]:
     return [fold(x) for x in values]
 
 
