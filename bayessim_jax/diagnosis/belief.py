@@ -19,15 +19,15 @@ def covariance_of(bench: Bench, entry: Entry) -> Float[np.ndarray, "k k"]:
 
     That of the fit, wide where windows disagree (`robust_covariance`), and for the number y = value(z) of an effect a
     variance (f y)² more, f its `EffectParameter.form`: recordings that fix a number to a thousandth fix it within one
-    form of its law. θ follows the number as the likelihood lets it: −H_θθ⁻¹ H_θx with H the fit's precision.
+    form of its law. For the moments of an event y is how far they are apart. θ follows the number as the likelihood
+    lets it: −H_θθ⁻¹ H_θx with H the fit's precision.
     """
     d = bench.d
     size = d + len(bench.columns(entry.candidate))
     covariance = robust_covariance(entry.fit)[:size, :size].copy()
-    values = np.array(list(bench.values(entry.candidate, entry.fit.z).values()))
     form = np.array([bench.parameters[i].form for i in bench.columns(entry.candidate)])
     # no wider than the prior, whose standard deviation is 1
-    own = np.minimum(form * np.abs(values) / np.maximum(_slopes(bench, entry), 1e-12), 1.0)
+    own = np.minimum(form * _sizes(bench, entry) / np.maximum(_slopes(bench, entry), 1e-12), 1.0)
     precision = np.asarray(entry.fit.precision)[:size, :size]
     follow = np.concatenate([-np.linalg.solve(precision[:d, :d], precision[:d, d:]), np.eye(size - d)])
     return covariance + (follow * own**2) @ follow.T
@@ -64,3 +64,15 @@ def _slopes(bench: Bench, entry: Entry) -> Float[np.ndarray, " e"]:
     """How fast the effects' numbers change with their z."""
     own = np.asarray(entry.fit.z)[bench.d :]
     return np.array([abs(bench.each[i].slope(own[j])) for j, i in enumerate(bench.columns(entry.candidate))])
+
+
+def _sizes(bench: Bench, entry: Entry) -> Float[np.ndarray, " e"]:
+    """What the numbers of effects are known relative to: their magnitudes, and the time between several moments."""
+    sizes, first = np.abs(list(bench.values(entry.candidate, entry.fit.z).values())), 0
+    for k in entry.candidate.effects:
+        own = bench.parameters[bench.first[k] : bench.first[k + 1]]
+        moments = [first + j for j, parameter in enumerate(own) if parameter.moment]
+        if len(moments) > 1:
+            sizes[moments] = np.ptp(sizes[moments])
+        first += len(own)
+    return sizes

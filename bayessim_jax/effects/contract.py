@@ -131,7 +131,7 @@ class EffectParameter:
     """Relative standard deviation of the number between forms of the law in use, which recordings do not tell.
 
     An interval is never narrower: a friction that recordings fix to a thousandth with one smooth sign is another with
-    another one.
+    another one. Of an effect's moments it is relative to the time between them.
     """
 
     least: float = 0.0

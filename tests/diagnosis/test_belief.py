@@ -21,6 +21,7 @@ class Bench:
 
     def __init__(self, effect="coulomb_friction"):
         self.parameters = EFFECTS[effect].parameters("joint/hinge", Scales(timestep=0.002, period=0.004))
+        self.first = [0, len(self.parameters)]
         self.each = [margin_of_effect(p) for p in self.parameters]
         self.margins = Margins.create(["theta"], [uniform(0.0, 1.0)])
 
@@ -60,6 +61,17 @@ def test_a_number_is_no_better_known_than_the_form_of_its_law(precision):
     expected = np.hypot(own * slope, bench.parameters[0].form * means["coulomb"])
     assert sds["coulomb"] == pytest.approx(expected, rel=1e-3)
     assert covariance_of(bench, found)[0, 0] == pytest.approx(1.0 / precision)  # the system's own have no form
+
+
+def test_a_pushs_beginning_and_end_are_as_well_known_as_it_is_short():
+    """Not by when it came."""
+    bench = Bench("disturbance_event")
+    start, end = bench.parameters[:2]
+    times = [bench.each[0].standard(0.7), bench.each[1].standard(0.9)]
+    means, sds = moments_of_effects(bench, entry([0.1, *times, 0.0], 1e12))
+    assert means["end"] - means["start"] == pytest.approx(0.2)
+    assert sds["start"] == pytest.approx(0.2 * start.form, rel=1e-3)
+    assert sds["end"] == pytest.approx(0.2 * end.form, rel=1e-3)
 
 
 def test_the_systems_parameters_follow_an_effect_whose_law_may_have_another_form():

@@ -90,6 +90,21 @@ def test_a_moment_is_found_from_the_end_of_a_window_too(problem, tmp_path):
         assert values == [pytest.approx(true["time"], abs=0.02), pytest.approx(true["gain"], abs=0.1)]
 
 
+def test_a_push_is_found_from_where_a_window_begins(problem, tmp_path):
+    """Earlier than that its beginning lies in another window, and that had no push at all."""
+    sealed = make_case(tmp_path / "push", "cart", "disturbance_event", strength=0.2, seed=8, recordings=2, seconds=2.0)
+    true, place = sealed["effects"][0]["parameters"], sealed["effects"][0]["at"]
+    screen = pose(tmp_path / "push", [("disturbance_event", place)]).screen([(EFFECTS["disturbance_event"], place)])
+    nothing = screen.begin(jnp.zeros(screen.d), jnp.array([0.01, 0.01, 0.1, 0.1]))
+    margins, d = screen.scene.margin[0], screen.d
+    p = np.array(nothing.p)
+    begin = (0.5 * np.floor(true["start"] / 0.5) - 0.02, true["end"], 0.7 * true["impulse"])
+    p[d : d + 3] = [m.standard(value) for m, value in zip(margins, begin, strict=True)]
+    found = screen.finish_candidate(Begun(Candidate((0,)), [(p, nothing.delta)], 0.0), nothing)
+    values = [float(m.value(float(z))) for m, z in zip(margins, found.p[d : d + 3], strict=True)]
+    assert values[:2] == [pytest.approx(true["start"], abs=0.06), pytest.approx(true["end"], abs=0.06)]
+
+
 @pytest.mark.parametrize("name", ["sensor_offset", "sensor_delay"])
 def test_the_screen_knows_what_a_sensors_error_changes_in_the_first_state_too(problem, name):
     place = "joint/hinge/qpos"
