@@ -22,16 +22,16 @@ from bayessim_jax.engines.tree.folding import (
     rotate,
     rotate_back,
     scale,
-    settle,
+    settle_vectors,
     vector,
 )
 from bayessim_jax.engines.tree.links import Inertia, Link, symmetric
 from bayessim_jax.trigonometry import sincos
 
-__all__ = ["Pose", "bias_forces", "mass_matrix", "place_links"]
+__all__ = ["LONG", "Pose", "bias_forces", "mass_matrix", "place_links"]
 
 LONG = 3
-"""Trees of more links than this have their composite inertias computed once each, which costs memory traffic."""
+"""Trees of more links than this have what links hand on to each other computed once, which costs memory traffic."""
 
 
 class Pose(NamedTuple):
@@ -50,9 +50,15 @@ class _Motion(NamedTuple):
     swirl: Matrix
 
 
-def place_links(links: Sequence[Link], q: Sequence[Folded]) -> list[Pose]:
-    """The pose of every link at joint positions q, m or rad."""
-    return [_place(link, x - link.reference) for link, x in zip(links, q, strict=True)]
+def place_links(links: Sequence[Link], q: Sequence[Folded], one: Folded | None = None) -> list[Pose]:
+    """The pose of every link at joint positions q, m or rad; with an `unknown_one` each computed once."""
+    poses = [_place(link, x - link.reference) for link, x in zip(links, q, strict=True)]
+    return poses if one is None else [_settle_pose(pose, one) for pose in poses]
+
+
+def _settle_pose(pose: Pose, one: Folded) -> Pose:
+    x, y, z, origin = settle_vectors(*pose.rotation, pose.origin, by=one)
+    return Pose((x, y, z), origin)
 
 
 def _place(link: Link, moved: Folded) -> Pose:
@@ -72,7 +78,9 @@ def _place(link: Link, moved: Folded) -> Pose:
     return Pose((x, y, z), link.offset)
 
 
-def bias_forces(links: Sequence[Link], poses: Sequence[Pose], gravity: Vector, v: Sequence[Folded]) -> list[Folded]:
+def bias_forces(
+    links: Sequence[Link], poses: Sequence[Pose], gravity: Vector, v: Sequence[Folded], one: Folded | None = None
+) -> list[Folded]:
     """b(q, q̇): what the joints carry at q̈ = 0, by one sweep outwards and one back (recursive Newton-Euler).
 
     With angular velocity ω, angular acceleration ω̇, acceleration a of the origin and S = [ω̇]× + [ω]×², a link asks
@@ -93,12 +101,18 @@ def bias_forces(links: Sequence[Link], poses: Sequence[Pose], gravity: Vector, v
         else:
             turn = add(turn, cross(spin, along))
             spin = add(spin, along)
+        if one is not None:
+            spin, turn, lift = settle_vectors(spin, turn, lift, by=one)
         swirl = _swirl(spin, turn)
         motions.append(_Motion(spin, turn, lift, swirl))
         mass, moment, rotational = link.inertia
-        forces.append(add(scale(mass, lift), rotate(swirl, moment)))
+        force = add(scale(mass, lift), rotate(swirl, moment))
         gyroscopic = cross(spin, rotate(rotational, spin))
-        moments.append(add(add(rotate(rotational, turn), gyroscopic), cross(moment, lift)))
+        torque = add(add(rotate(rotational, turn), gyroscopic), cross(moment, lift))
+        if one is not None:
+            force, torque = settle_vectors(force, torque, by=one)
+        forces.append(force)
+        moments.append(torque)
     torques = [fold(0.0)] * len(links)
     for i in reversed(range(len(links))):
         link, pose = links[i], poses[i]
@@ -106,18 +120,20 @@ def bias_forces(links: Sequence[Link], poses: Sequence[Pose], gravity: Vector, v
         if link.parent >= 0:
             force = rotate(pose.rotation, forces[i])
             moment = add(rotate(pose.rotation, moments[i]), cross(pose.origin, force))
-            forces[link.parent] = add(forces[link.parent], force)
-            moments[link.parent] = add(moments[link.parent], moment)
+            force, moment = add(forces[link.parent], force), add(moments[link.parent], moment)
+            if one is not None:
+                force, moment = settle_vectors(force, moment, by=one)
+            forces[link.parent], moments[link.parent] = force, moment
     return torques
 
 
-def mass_matrix(links: Sequence[Link], poses: Sequence[Pose]) -> list[list[Folded]]:
+def mass_matrix(links: Sequence[Link], poses: Sequence[Pose], one: Folded | None = None) -> list[list[Folded]]:
     """M(q), symmetric, by the composite-rigid-body algorithm; entries between branches are zero while tracing."""
     composite = [link.inertia for link in links]
     for i in reversed(range(len(links))):
         if links[i].parent >= 0:
             joined = _join(composite[links[i].parent], composite[i], poses[i])
-            composite[links[i].parent] = _settle(joined) if len(links) > LONG else joined
+            composite[links[i].parent] = _settle(joined, one) if len(links) > LONG else joined
     size = len(links)
     matrix = [[fold(0.0)] * size for _ in range(size)]
     for i, link in enumerate(links):
@@ -173,8 +189,7 @@ def _join(a: Inertia, b: Inertia, pose: Pose) -> Inertia:
     return Inertia(a.mass + b.mass, add(a.moment, shifted), symmetric(entry))
 
 
-def _settle(inertia: Inertia) -> Inertia:
-    x, y, z = settle(*inertia.moment)
+def _settle(inertia: Inertia, one: Folded | None) -> Inertia:
     (a, b, c), (_, d, e), (_, _, f) = inertia.rotational
-    a, b, c, d, e, f = settle(a, b, c, d, e, f)
-    return Inertia(inertia.mass, (x, y, z), ((a, b, c), (b, d, e), (c, e, f)))
+    moment, (a, b, c), (d, e, f) = settle_vectors(inertia.moment, (a, b, c), (d, e, f), by=one)
+    return Inertia(inertia.mass, moment, ((a, b, c), (b, d, e), (c, e, f)))

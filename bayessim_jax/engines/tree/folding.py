@@ -25,6 +25,7 @@ __all__ = [
     "rotate_back",
     "scale",
     "settle",
+    "settle_vectors",
     "vector",
 ]
 
@@ -163,10 +164,25 @@ def multiply(a: Matrix, b: Matrix) -> Matrix:
     return x, y, z
 
 
-def settle(*values: Folded) -> tuple[Folded, ...]:
-    """The same numbers, computed here once: a compiler may otherwise repeat them in whatever uses them."""
+def unknown_one(value: Folded) -> Folded:
+    """1 as the compiler cannot tell: 1 + 0 x, which is none where x is not finite."""
+    return value if value.known else Folded(1.0 + 0.0 * value.value)
+
+
+def settle(*values: Folded, by: Folded | None = None) -> tuple[Folded, ...]:
+    """The same numbers, computed here once: a compiler may otherwise repeat them in whatever uses them.
+
+    Barriers of the compiler's own are gone before it decides on that, where loops are made one piece of code. There a
+    division holds, which it never repeats: `by` an `unknown_one`.
+    """
     traced = [v.value for v in values if not v.known]
     if not traced:
         return values
-    settled = iter(jax.lax.optimization_barrier(traced))
+    settled = iter(jax.lax.optimization_barrier(traced) if by is None else [x / by.value for x in traced])
     return tuple(v if v.known else Folded(next(settled)) for v in values)
+
+
+def settle_vectors(*vectors: Vector, by: Folded | None = None) -> list[Vector]:
+    """Vectors, each component settled."""
+    flat = settle(*(x for v in vectors for x in v), by=by)
+    return [(flat[k], flat[k + 1], flat[k + 2]) for k in range(0, len(flat), 3)]

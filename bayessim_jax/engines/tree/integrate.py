@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import mujoco
 
 from bayessim_jax.engines.tree.constraints import constraint_forces
-from bayessim_jax.engines.tree.dynamics import bias_forces, mass_matrix, place_links
-from bayessim_jax.engines.tree.folding import Folded, fold, settle
+from bayessim_jax.engines.tree.dynamics import LONG, bias_forces, mass_matrix, place_links
+from bayessim_jax.engines.tree.folding import Folded, fold, settle, unknown_one
 from bayessim_jax.engines.tree.forces import Forces, joint_forces
 from bayessim_jax.engines.tree.prepare import Tree
 from bayessim_jax.engines.tree.solve import add_to_diagonal, solve
@@ -42,22 +42,23 @@ def _equations(
     tree: Tree, q: Coordinates, v: Coordinates, ctrl: Sequence[Folded], applied: Sequence[Folded]
 ) -> tuple[Rows, Coordinates, Forces]:
     """M with the armatures, τ − b with the constraints' forces in τ, and the joints' forces."""
-    poses = place_links(tree.links, q)
-    bias = bias_forces(tree.links, poses, tree.gravity, v)
-    matrix = add_to_diagonal(mass_matrix(tree.links, poses), tree.armature)
+    one = unknown_one(q[0]) if len(tree.links) > LONG else None
+    poses = place_links(tree.links, q, one)
+    bias = bias_forces(tree.links, poses, tree.gravity, v, one)
+    matrix = add_to_diagonal(mass_matrix(tree.links, poses, one), tree.armature)
     forces = joint_forces(tree.model, tree.numbers, q, v, ctrl)
     right = [f + a - b for f, a, b in zip(forces.force, applied, bias, strict=True)]
     if len(tree.links) > SHORT:
-        matrix, right = _settle(matrix, right)
+        matrix, right = _settle(matrix, right, one)
     if tree.constraints:
         held = constraint_forces(tree.constraints, tree.numbers, tree.weights, matrix, right, q, v)
         right = [f + c for f, c in zip(right, held, strict=True)]
     return matrix, right, forces
 
 
-def _settle(matrix: Rows, right: Coordinates) -> tuple[Rows, Coordinates]:
+def _settle(matrix: Rows, right: Coordinates, one: Folded | None) -> tuple[Rows, Coordinates]:
     size = len(right)
-    settled = iter(settle(*(matrix[i][j] for i in range(size) for j in range(i + 1)), *right))
+    settled = iter(settle(*(matrix[i][j] for i in range(size) for j in range(i + 1)), *right, by=one))
     matrix = [row[:] for row in matrix]
     for i in range(size):
         for j in range(i + 1):
