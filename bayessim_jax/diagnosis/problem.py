@@ -55,9 +55,8 @@ class Problem:
         """All pairs, to be held against some of the windows."""
         return self.screen(self.pairs)
 
-    @cached_property
     def screens(self) -> list[Screen]:
-        """The same for each of those who work at the same time."""
+        """The same for each of those who work at the same time; what the others keep from fit to fit goes with them."""
         return [self.every, *(self.every.twin() for _ in range(1, WORKERS))]
 
     def screen(self, pairs: Sequence[tuple[Any, str]], slots: int = SLOTS) -> Screen:

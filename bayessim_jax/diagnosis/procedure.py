@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 from bayessim_jax.diagnosis.bench import Bench, Candidate
 from bayessim_jax.diagnosis.finals import Finals, Work, enter, without_effects
 from bayessim_jax.diagnosis.problem import Problem
-from bayessim_jax.diagnosis.screen import Begun, Screen, Screened
+from bayessim_jax.diagnosis.screen import Screen, Screened
 from bayessim_jax.diagnosis.search import PAIRS, Growth, finalists, find_pairs, rank, varied, with_room
 from bayessim_jax.diagnosis.verdict import (
     Diagnosis,
@@ -91,7 +91,9 @@ def name_effects(
     screen, start = problem.every, detected.fit
     say(f"holding {len(problem.pairs)} candidates against the recorded motion")
     nothing = screen.begin(start.z[: screen.d], start.sigma)
-    ranked, begun = rank(problem.screens, nothing, say)
+    screens = problem.screens()
+    ranked, begun = rank(screens, nothing, say)
+    growth = Growth(screens, begun)
     listed = [(screen.name(each.candidate), each.likelihood - nothing.score) for each in begun]
     if not ranked:
         return Diagnosis("unexplained", *detect(key, problem, problem.still(start)), [])
@@ -107,7 +109,7 @@ def name_effects(
         return Diagnosis("unexplained", work.bench, none, entries, screened=listed)
     if _is_not_enough(problem, entries, none, thresholds):
         say("one effect is not enough: trying pairs")
-        entries = _hold_sets(key, problem, finals, entries, nothing, ranked, begun)
+        entries = _hold_sets(key, problem, finals, growth, entries, nothing, ranked)
     return decide(work.bench, none, entries, work.group, thresholds, listed)
 
 
@@ -130,19 +132,18 @@ def _hold_sets(
     key: PRNGKeyArray,
     problem: Problem,
     finals: Finals,
+    growth: Growth,
     entries: list[Entry],
     nothing: Screened,
     ranked: Sequence[Screened],
-    begun: Sequence[Begun],
 ) -> list[Entry]:
     """Pairs, and larger sets where the best pair is worth both of its effects and is not enough either.
 
-    From the single effects, as they were `ranked` and `begun` along the motion, and the `entries` that were simulated.
+    From the single effects, as they were `ranked` along the motion, and the `entries` that were simulated.
     """
     work, none, thresholds, remain = finals.work, finals.none, finals.thresholds, finals.remain
     explained = bool(entries) and explains(entries[0], none, thresholds)
     worth = thresholds.worth * remain(ranked[0]) if explained else np.inf
-    growth = Growth(problem.screens, begun)
     found = find_pairs(key, growth, nothing, ranked)
     # without a model there is no motion to hold candidates against: what was simulated already is in its order
     chosen = found[:PAIRS] if isinstance(problem.system, Restarted) else varied(found, nothing.score)

@@ -81,8 +81,6 @@ class Linearized:
     """Along θ's z and the model's own parameters of a candidate."""
     gap: Float[Array, "windows steps n"]
     """F(x̄_t, u_t; θ) − x̄_{t+1}."""
-    heavier: Float[Array, "windows steps d nv nv"] | None = None
-    """∂(b_v⁻¹)/∂θ_j, with b_v the rows of b that are velocities: what withstands forces grows linearly with masses."""
 
 
 @struct.dataclass
@@ -247,7 +245,7 @@ def move_steps(
     shift: Float[Numbers, " d"],
     substeps: int,
 ) -> tuple[Float[Array, "windows steps n"], Float[Array, "windows steps n nv"], Bool[Array, ""]]:
-    """`gap` and `b` of linearized steps where only θ is another, by `shift`; forces do what `heavier` says.
+    """`gap` and `b` of linearized steps where only θ is another, by `shift`; forces do what `find_heavier` says.
 
     And whether every joint gives way to a force on it: inertia that is not linear in θ may come out negative.
     """
@@ -278,7 +276,10 @@ def _divide(b: Float[Array, "windows steps n nv"], by: Float[Array, "windows ste
 def find_heavier(
     lin: Linearized, gaps: Float[Array, "d k windows steps n"], width: Float[Numbers, " nv"], by: Float[Numbers, " d"]
 ) -> Float[Array, "windows steps d nv nv"]:
-    """`Linearized.heavier` from gaps with each θ larger by so much: without a force, and with one of a width each."""
+    """∂(b_v⁻¹)/∂θ_j, with b_v the rows of b that are velocities: what withstands forces grows linearly with masses.
+
+    From gaps with each θ larger by so much: without a force, and with one of a width each.
+    """
     nv = len(width)
     there = (gaps[:, 1 : nv + 1] - gaps[:, :1]) / width[:, None, None, None]
     there = jnp.transpose(there[..., nv:], (2, 3, 0, 4, 1))

@@ -276,7 +276,7 @@ class Scene(CandidatesOf):
         lin = None
         if base and not moves and not base.edits:
             x, shift = self._full(candidate, p), self._theta(p) - self._theta(base.p)
-            at_work = (base.lin.b, base.lin.heavier, shift, self.system.substeps)
+            at_work = (base.lin.b, self._heavier, shift, self.system.substeps)
             gap, b, gives_way = move_steps(self.engine, self.numbers, motion, x, *at_work)
             lin = dataclasses.replace(base.lin, gap=gap, b=b) if gives_way else None
         if lin is None:
@@ -284,10 +284,8 @@ class Scene(CandidatesOf):
             count, beside, ways = self._look_beside(candidate, p, moves, forced, base is None)
             gaps = self._find_gaps(motion, beside, count)
             lin = differ(base.lin if base else None, gaps, ways, forced, self.step > 0.0)
-        if base is None and self.d:
-            if self._heavier is None:
-                self._heavier = self._find_heavier(candidate, p, motion, lin)
-            lin = dataclasses.replace(lin, heavier=self._heavier)
+        if self._heavier is None and self.d:
+            self._heavier = self._find_heavier(candidate, p, motion, lin)
         kept, windowed = np.where(self._steps(candidate), p, 0.0), self._windowed(p, motion)
         shared, weighed = (base.shared, base.weighed) if base else (respond(lin, windowed, self.d), {})
         return _Around(self._edits(candidate), kept, motion, lin, windowed, shared, weighed)

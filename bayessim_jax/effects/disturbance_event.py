@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from functools import partial
 
 import jax.numpy as jnp
 import mujoco
@@ -35,11 +35,11 @@ class DisturbanceEvent(OpenForm, ForceEffect):
 
     def parameters(self, place: str, scales: Scales) -> tuple[EffectParameter, ...]:
         """t₀, t₁ and P; the taper where that is free."""
-        moment: dict[str, Any] = {"scan": 8, "moment": True, "form": 0.08}
+        moment = partial(EffectParameter, scan=8, moment=True, form=0.08)
         duration, impulse = scales.duration, 12.0 * scales.inertia * scales.speed
         return (
-            EffectParameter("start", "s", 0.0, duration, 0.45 * duration, 0.45 * duration, **moment),
-            EffectParameter("end", "s", 0.0, duration, 0.55 * duration, 0.55 * duration, **moment),
+            moment("start", "s", 0.0, duration, 0.45 * duration, 0.45 * duration),
+            moment("end", "s", 0.0, duration, 0.55 * duration, 0.55 * duration),
             EffectParameter("impulse", f"{scales.force_unit} s", -impulse, impulse, 0.0, 0.02 * impulse, form=0.01),
             *((EffectParameter(TAPER, "", 0.05, 1.0, 1.0, 0.6, form=0.3),) if self.rounded else ()),
         )

@@ -16,7 +16,10 @@ __all__ = ["probe_inertia"]
 
 
 def probe_inertia(engine: Any, theta: Float[Array, " d"], qpos: Float[Array, " nq"], dof: int) -> Scalar:
-    """`Engine.inertia` by how much a push of one time step moves the joint from rest."""
+    """`Engine.inertia` by how much a push of one time step moves the joint from rest.
+
+    Where the step is implicit, damping within it counts as inertia.
+    """
     model, kind = engine.model, jnp.result_type(theta)
     push = float(free_inertia(model, mujoco.MjData(model), model.qpos0)[dof]) / float(model.opt.timestep)
     state = engine.init(theta, jnp.asarray(qpos, kind), jnp.zeros(model.nv, kind))

@@ -159,17 +159,17 @@ def test_what_forces_do_is_known_where_masses_are_far_from_those_of_before():
         points = np.tile(np.array([0.3, 0.1]) + by * (np.arange(2) == j), (3, 1))
         force = np.concatenate([np.zeros((1, 2)), np.diag(width)])
         every.append(find_gaps(arm.engine, _same, motion, Beside(points, np.zeros((3, 4)), force), 3, 2))
-    here = here.replace(heavier=find_heavier(here, jnp.stack(every), width, by))
+    heavier = find_heavier(here, jnp.stack(every), width, by)
     theta, shift = np.array([1.2, 0.5]), np.array([0.9, 0.4])
-    gap, b, gives_way = move_steps(arm.engine, _same, motion, theta, here.b, here.heavier, shift, 2)
+    gap, b, gives_way = move_steps(arm.engine, _same, motion, theta, here.b, heavier, shift, 2)
     size = np.abs(there.b).max()
     assert np.abs(here.b - there.b).max() > 0.5 * size
     np.testing.assert_allclose(b, there.b, atol=5e-3 * size)
     np.testing.assert_allclose(gap, there.gap, atol=1e-12)
     assert gives_way
-    assert not move_steps(arm.engine, _same, motion, theta, here.b, here.heavier, -10.0 * shift, 2)[2]
+    assert not move_steps(arm.engine, _same, motion, theta, here.b, heavier, -10.0 * shift, 2)[2]
     # also from elsewhere
-    _, b, _ = move_steps(arm.engine, _same, motion, np.array([0.3, 0.1]), there.b, here.heavier, -shift, 2)
+    _, b, _ = move_steps(arm.engine, _same, motion, np.array([0.3, 0.1]), there.b, heavier, -shift, 2)
     np.testing.assert_allclose(b, here.b, atol=5e-3 * np.abs(here.b).max())
 
 

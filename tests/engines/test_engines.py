@@ -12,6 +12,7 @@ from bayessim_jax.engines.fields import Write
 from bayessim_jax.engines.mjx import MjxEngine
 from bayessim_jax.engines.mujoco import MujocoEngine
 from bayessim_jax.engines.tree import TreeEngine
+from bayessim_jax.engines.tree.folding import fold, unknown_one
 from bayessim_jax.mechanics import free_inertia
 from tests.engines.mechanisms import HOPPER, MODELS
 
@@ -209,7 +210,7 @@ def test_what_a_joint_shows_of_inertia_follows_theta():
 
 
 def test_the_compiler_does_not_repeat_what_the_links_of_an_arm_hand_on():
-    """An operation that many others use would otherwise be in each of them: five times the code, and twice the time."""
+    """An operation that many others use would otherwise be in each of them: four times the code."""
     model = mujoco.MjModel.from_xml_string(MODELS["six_joint_arm"])
     engine = TreeEngine(model)
 
@@ -220,3 +221,9 @@ def test_the_compiler_does_not_repeat_what_the_links_of_an_arm_hand_on():
     lowered = jax.jit(jax.vmap(one), compiler_options=LOOPS).lower(qpos, qvel, ctrl)
     written, made = lowered.as_text().count(" = "), lowered.compile().as_text().count(" = ")
     assert made < 3 * written
+
+
+@pytest.mark.parametrize("value", [0.3, jnp.array(0.3), jnp.array(-1e30)])
+def test_a_one_that_the_compiler_does_not_know_is_one(value):
+    """Also of a number that is known while tracing."""
+    assert unknown_one(fold(value)).value == 1.0

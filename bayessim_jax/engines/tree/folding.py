@@ -26,6 +26,7 @@ __all__ = [
     "scale",
     "settle",
     "settle_vectors",
+    "unknown_one",
     "vector",
 ]
 
@@ -166,7 +167,7 @@ def multiply(a: Matrix, b: Matrix) -> Matrix:
 
 def unknown_one(value: Folded) -> Folded:
     """1 as the compiler cannot tell: 1 + 0 x, which is none where x is not finite."""
-    return value if value.known else Folded(1.0 + 0.0 * value.value)
+    return Folded(1.0 + 0.0 * value.value)
 
 
 def settle(*values: Folded, by: Folded | None = None) -> tuple[Folded, ...]:
