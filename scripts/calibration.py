@@ -63,10 +63,10 @@ def main() -> None:
 
 
 def _setup(name: str, proposal: str, recordings: int, rounds: int) -> online.Setup:
-    """Random actions; every recording is remembered."""
+    """Random actions; every recording is remembered, but no more than a run remembers where nothing is asked for."""
     entry = lookup(name)
     system, task = entry.system(), entry.task()
-    actor, history = Fixed(RandomPolicy(system.actions)), recordings * rounds
+    actor, history = Fixed(RandomPolicy(system.actions)), min(recordings * rounds, online.Setup.history)
     sizes = {"recordings": recordings, "history": history, "evaluations": 0}
     return online.Setup.create(system, actor, task, proposal=proposal, **sizes)
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bayessim_jax.contracts import Scalar
@@ -54,11 +55,11 @@ class FitInfo:
 
 def systematic(key: PRNGKeyArray, weights: Float[Array, " n"], draws: int) -> Int[Array, " draws"]:
     """Indices in proportion to weights with the least possible variance, in random order."""
-    shuffle_key, offset_key = jax.random.split(key)
+    uniforms = jax.random.uniform(key, (1 + draws,))
     cumulative = jnp.cumsum(weights)
-    points = (jnp.arange(draws) + jax.random.uniform(offset_key)) / draws * cumulative[-1]
+    points = (jnp.arange(draws) + uniforms[0]) / draws * cumulative[-1]
     picks = jnp.clip(jnp.searchsorted(cumulative, points), 0, weights.size - 1)
-    return jax.random.permutation(shuffle_key, picks)
+    return picks[jnp.argsort(uniforms[1:])]
 
 
 def fit(
@@ -83,20 +84,22 @@ def fit(
     batches = max(schedule.draws // schedule.batch, 1)
     total = schedule.epochs * batches
     optimizer = optax.chain(optax.clip_by_global_norm(5.0), optax.scale_by_adam())
+    # one vector of weights: with a leaf for each layer there is several times as much to compile, and to start
+    start, restore = ravel_pytree(params)
 
     def take(tree: Any, rows: Any) -> Any:
         return jax.tree.map(lambda leaf: leaf[rows], tree)
 
-    def score(params: Any) -> Scalar:
-        return log_prob(params, take(inputs, shown), z[shown]).mean()
+    def score(weights: Array) -> Scalar:
+        return log_prob(restore(weights), take(inputs, shown), z[shown]).mean()
 
     def update(carry: Any, rows: Any) -> Any:
         params, opt_state, count, skipped = carry
-        loss, grads = jax.value_and_grad(lambda p: -log_prob(p, take(inputs, rows), z[rows]).mean())(params)
+        loss, grads = jax.value_and_grad(lambda p: -log_prob(restore(p), take(inputs, rows), z[rows]).mean())(params)
         rate = schedule.learning_rate * 0.5 * (1 + jnp.cos(jnp.pi * count / total))
         sound = jnp.isfinite(loss) & jnp.isfinite(optax.tree.norm(grads))
         direction, new_opt_state = optimizer.update(grads, opt_state, params)
-        new_params = jax.tree.map(lambda p, step: p - rate * (step + schedule.weight_decay * p), params, direction)
+        new_params = params - rate * (direction + schedule.weight_decay * params)
         keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(sound, a, b), new, old)  # noqa: E731
         carry = (keep(new_params, params), keep(new_opt_state, opt_state), count + 1, skipped + ~sound)
         return carry, jnp.where(sound, -loss, 0.0)
@@ -121,10 +124,11 @@ def fit(
         return (done + schedule.check_every <= schedule.epochs) & (done - best["epoch"] < schedule.patience)
 
     low = jnp.array(-jnp.inf)
-    best = {"params": params, "validation": low, "train": low, "epoch": jnp.array(0)}
-    start = ((params, optimizer.init(params), jnp.array(0), jnp.array(0)), best, jnp.array(0))
-    carry, best, done, last = jax.lax.while_loop(more, block, (*start, {"validation": low, "train": low}))
-    return best["params"], FitInfo(
+    best = {"params": start, "validation": low, "train": low, "epoch": jnp.array(0)}
+    carry = (start, optimizer.init(start), jnp.array(0), jnp.array(0))
+    loop = (carry, best, jnp.array(0), {"validation": low, "train": low})
+    carry, best, done, last = jax.lax.while_loop(more, block, loop)
+    return restore(best["params"]), FitInfo(
         log_q_train=best["train"],
         log_q_validation=best["validation"],
         best_epoch=best["epoch"],

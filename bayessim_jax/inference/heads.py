@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -58,9 +59,8 @@ class MixtureHead:
         out = (x @ params["out"]).reshape(*x.shape[:-1], k, -1)
         logits, mean, log_diagonal, below = jnp.split(out, [1, 1 + d, 1 + 2 * d], axis=-1)
         log_diagonal = jnp.clip(log_diagonal + params["log_diagonal"], -7.0, 12.0)
-        factor = jnp.exp(log_diagonal)[..., None] * jnp.eye(d)
-        rows, columns = jnp.tril_indices(d, -1)
-        factor = factor.at[..., rows, columns].set(below + params["below"])
+        entries = jnp.concatenate([jnp.exp(log_diagonal), below + params["below"]], axis=-1)
+        factor = jnp.dot(entries, _places(d), precision="highest").reshape(*entries.shape[:-1], d, d)
         return jax.nn.log_softmax(logits[..., 0] + params["logits"]), mean + params["mean"], factor
 
     def log_prob(self, params: Any, x: Float[Array, "*n inputs"], z: Float[Array, "*n d"]) -> Float[Array, "*n"]:
@@ -89,3 +89,14 @@ class MixtureHead:
             "log_diagonal": params["log_diagonal"] + jnp.log(scale),
             "below": params["below"] * scale[columns],
         }
+
+
+def _places(d: int) -> Float[np.ndarray, "entries d*d"]:
+    """Where the diagonal and what is below it stand in a matrix read row by row.
+
+    A product with it costs nothing to compile, and neither do its derivatives; writing to indices is a loop on a CPU.
+    """
+    rows, columns = (np.concatenate([np.arange(d), below]) for below in np.tril_indices(d, -1))
+    places = np.zeros((rows.size, d * d), np.float32)
+    places[np.arange(rows.size), d * rows + columns] = 1.0
+    return places

@@ -336,7 +336,8 @@ def test_the_ground_of_the_vehicle_changes_and_theta_does_not(tmp_path):
         read_command(["pendulum", "--config", str(tmp_path / "c.toml")])
 
 
-@pytest.mark.parametrize("system", ["skid_steer", pytest.param("pendulum", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("system", ["skid_steer", "pendulum"])
 def test_a_planner_drives_through_the_command(tmp_path, system):
     out = tmp_path / "run"
     text = TINY[: TINY.index("[learner]")].replace('"cartpole"', f'"{system}"').replace("rounds = 3", "rounds = 2")

@@ -173,7 +173,7 @@ def test_what_forces_do_is_known_where_masses_are_far_from_those_of_before():
     np.testing.assert_allclose(b, here.b, atol=5e-3 * np.abs(here.b).max())
 
 
-@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize("joint", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_no_force_explains_more_than_any_force_on_its_joint(arm, joint):
     """A force that is held for whole pieces is explained, and on the other joint less of it is."""
     ctrl, start = jnp.zeros((STEPS, 1)), (jnp.array([0.6, -0.4]), jnp.array([1.0, -2.0]))

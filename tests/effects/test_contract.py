@@ -126,7 +126,7 @@ def seen_without_effects(engine):
     return np.asarray(observe_all(with_effects(system(*MODELS["arm"], engine=engine), []))(jnp.array([0.5])))
 
 
-@pytest.mark.parametrize("engine", ["tree", "mujoco"])
+@pytest.mark.parametrize("engine", ["tree", pytest.param("mujoco", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ON_ARM)
 def test_at_neutral_parameters_the_simulator_is_the_original(name, engine, in_float64):
     base = system(*MODELS["arm"], engine=engine)
@@ -170,6 +170,7 @@ def test_derivatives_are_finite_and_not_zero_where_a_fit_begins(name):
         assert jnp.isfinite(jacobian(neutral_of(augmented))).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ON_ARM)
 def test_derivatives_are_those_of_finite_differences(name):
     base = system(*MODELS["arm"])
@@ -184,8 +185,9 @@ def test_derivatives_are_those_of_finite_differences(name):
             assert jnp.abs(slope - jacobian[..., k]).max() < 0.02 * scale + 1e-7 / step * 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ON_ARM)
-@pytest.mark.parametrize("timestep", [pytest.param(0.002, marks=pytest.mark.slow), 0.005])
+@pytest.mark.parametrize("timestep", [0.002, 0.005])
 def test_corners_of_the_ranges_are_stable_in_float32(name, timestep):
     base = system(arm(timestep), "lower")
     augmented = attach(name, base)
@@ -357,7 +359,12 @@ def test_a_rotor_remembers_what_arrived_of_commands(effect, values):
 
 
 @pytest.mark.parametrize(
-    ("effect", "values"), [("sensor_offset", [0.2]), ("sensor_scale", [1.3]), ("sensor_delay", [0.015])]
+    ("effect", "values"),
+    [
+        ("sensor_offset", [0.2]),
+        pytest.param("sensor_scale", [1.3], marks=pytest.mark.slow),
+        pytest.param("sensor_delay", [0.015], marks=pytest.mark.slow),
+    ],
 )
 def test_a_rotor_remembers_the_motion_behind_what_was_shown(effect, values):
     """A spring is bent by what the joint did, and not by what a sensor made of it."""

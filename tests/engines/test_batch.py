@@ -30,7 +30,10 @@ def last(request):
     return run
 
 
-@pytest.mark.parametrize(("size", "out_axes"), [(131, 0), (384, -1)], ids=["whole", "in blocks"])
+@pytest.mark.parametrize(
+    ("size", "out_axes"),
+    [pytest.param(131, 0, id="whole", marks=pytest.mark.slow), pytest.param(384, -1, id="in blocks")],
+)
 def test_a_spread_batch_is_the_batch(last, size, out_axes):
     compiled, placed = compile_batched(last, THETAS[:size], out_axes=out_axes)
     expected = jax.jit(jax.vmap(last, out_axes=out_axes))(THETAS[:size])

@@ -176,7 +176,10 @@ def test_mjx_derives_what_mujoco_derives():
         np.testing.assert_allclose(getattr(ours, field), getattr(theirs, field), rtol=2e-4, err_msg=field)
 
 
-@pytest.mark.parametrize("name", ["double_pendulum", "spatial_arm", "springs", "limits", "dry_friction"])
+@pytest.mark.parametrize(
+    "name",
+    ["double_pendulum", pytest.param("spatial_arm", marks=pytest.mark.slow), "springs", "limits", "dry_friction"],
+)
 def test_the_tree_engine_is_differentiable(name):
     """Forward derivatives of the last state with respect to every θ are the quotients of differences."""
     with jax.enable_x64(True):

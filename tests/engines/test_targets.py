@@ -69,7 +69,9 @@ def returns(target, policy, steps, episodes):
     return np.asarray(recordings.rewards.sum(-1)), recordings
 
 
-@pytest.mark.parametrize(("name", "policy", "steps"), [("cartpole", FALL, 100), ("pendulum", BRAKE, 100)])
+@pytest.mark.parametrize(
+    ("name", "policy", "steps"), [("cartpole", FALL, 100), pytest.param("pendulum", BRAKE, 100, marks=pytest.mark.slow)]
+)
 def test_targets_agree_in_return(name, policy, steps):
     """The same policy on the same θ: the two samples of returns pass for one."""
     from scipy.stats import ks_2samp

@@ -80,6 +80,7 @@ def test_the_same_seed_gives_the_same_draws_and_another_does_not(monkeypatch):
     assert not np.array_equal(first, other)
 
 
+@pytest.mark.slow
 def test_what_no_simulation_shows_is_doubted(monkeypatch):
     """A wave in the middle of every window that neither parameter nor noise explains."""
     monkeypatch.setattr(networks, "ROUNDS", 1)

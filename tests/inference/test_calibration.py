@@ -135,7 +135,7 @@ def test_a_nan_is_never_silent(tool):
     assert np.isnan(outcome).all()
 
 
-@pytest.mark.parametrize("shift", [0.0, 1.0, 4.0])
+@pytest.mark.parametrize("shift", [0.0, pytest.param(1.0, marks=pytest.mark.slow), 4.0])
 def test_classifier_comes_close_to_the_best_accuracy(shift):
     rng = np.random.default_rng(2)
     x, y = (rng.normal(size=(500, 2)).astype(np.float32) for _ in range(2))

@@ -102,6 +102,7 @@ def test_a_calibrated_gaussian_stays_what_it_is():
     assert -0.02 < float(loss.mean()) < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "slack"), [(64, 0.05), (256, 0.025)])
 def test_few_sets_make_neither_too_small_nor_too_large_sets(n, slack):
     def one(key):

@@ -77,7 +77,7 @@ def test_it_keeps_the_contract_of_learners():
     assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True))
 
 
-@pytest.mark.parametrize("changes", [{}, {"critics": 2, "smoothing": 0.2}])
+@pytest.mark.parametrize("changes", [{}, pytest.param({"critics": 2, "smoothing": 0.2}, marks=pytest.mark.slow)])
 def test_a_sparse_goal_is_reached(changes):
     """The point is at the goal at the end of an episode by chance in 3 % of them; trained, in nine of ten."""
     learner, state, step = case(**changes)

@@ -60,6 +60,7 @@ def over_the_prior(name):
     return box.low, box.high
 
 
+@pytest.mark.slow
 def test_ppo_balances_a_known_pole():
     policy = train("cartpole", *near([0.5, 0.3]), calls=12)
     assert (returns("cartpole", [0.5, 0.3], policy, 20) >= 500).mean() >= 0.95
@@ -71,6 +72,7 @@ def test_sac_swings_a_known_pendulum_up():
     assert returns("pendulum", [0.8, 0.6], policy, 20).mean() > -200
 
 
+@pytest.mark.slow
 def test_ppo_raises_a_known_acrobot():
     policy = train("acrobot", *near([1.0, 1.0, 1.0, 1.0]), calls=8)
     assert returns("acrobot", [1.0, 1.0, 1.0, 1.0], policy, 20).mean() > -110

@@ -71,7 +71,7 @@ def test_interpolation_is_exact_at_its_nodes_and_for_polynomials():
     np.testing.assert_allclose(lagrange(nodes, 0.0) @ values, 2.0, rtol=1e-9)
 
 
-@pytest.mark.parametrize("finer", [0.5, 16.0])
+@pytest.mark.parametrize("finer", [0.5, pytest.param(16.0, marks=pytest.mark.slow)])
 def test_the_step_of_what_was_recorded_is_found_and_does_not_bend_parameters(tmp_path, finer):
     sealed = make_case(
         tmp_path / "case", "double", finer=finer, noise=0.1, rate=125.0, recordings=4, seconds=3.0, seed=2
@@ -110,7 +110,7 @@ def test_steps_of_euler_show_in_positions_alone_where_those_of_runge_and_kutta_a
 
 
 @pytest.mark.parametrize("rig", ["slide", pytest.param("double", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("finer", [0.25, 1.0, 16.0])
+@pytest.mark.parametrize("finer", [0.25, 1.0, pytest.param(16.0, marks=pytest.mark.slow)])
 def test_positions_and_velocities_tell_the_step_whatever_moves_the_machine(tmp_path, rig, finer):
     settings = {"strength": 0.3, "recordings": 4, "seconds": 3.0, "rate": 125.0, "seed": 2}
     make_case(tmp_path / "case", rig, "viscous_friction", finer=finer, **settings)

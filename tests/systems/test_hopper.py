@@ -49,6 +49,7 @@ def test_in_the_air_one_step_is_gymnasiums():
         assert float(reward) == pytest.approx(paid, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_the_gap_between_the_engines_is_as_stated():
     gaps, rewards, same_end = compare(Hopper.create(noise=0.0), *record(30, 15, 0))
     """What is left is single precision, and contacts of links that Brax's model has none for."""

@@ -42,7 +42,9 @@ def test_registered_systems_keep_the_contract(name):
     assert system.noise.shape == (system.observations.size,)
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "fetch_slide" else ()) for name in SYSTEMS]
+)
 def test_rollouts_stay_finite_over_the_whole_prior(name):
     system, task = SYSTEMS[name].system(), SYSTEMS[name].task()
     box = system.parameters
