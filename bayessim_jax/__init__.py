@@ -5,8 +5,8 @@ import os
 __version__ = "0.1.0"
 
 # XLA's pool has as many threads as the machine has cores, unless NPROC says otherwise. The operations of small networks
-# and time steps take less than to hand them to it, and jaxlib's batched LAPACK kernels wait in it for each other, for ever
-# where they hold all of its threads. With one thread both are done where they are called.
+# and time steps take less time than to hand them to it, and jaxlib's batched LAPACK kernels wait in it for each other,
+# for ever where they hold all of its threads. With one thread both are done where they are called.
 os.environ.setdefault("NPROC", "1")
 
 # XLA hands the operations of a time step to its pool one by one, which costs several times what they do. With this a

@@ -63,7 +63,7 @@ def main() -> None:
 
 
 def _setup(name: str, proposal: str, recordings: int, rounds: int) -> online.Setup:
-    """Random actions; every recording is remembered, but no more than a run remembers where nothing is asked for."""
+    """Random actions; all recordings are remembered, but no more than a run remembers where nothing is asked for."""
     entry = lookup(name)
     system, task = entry.system(), entry.task()
     actor, history = Fixed(RandomPolicy(system.actions)), min(recordings * rounds, online.Setup.history)

@@ -339,7 +339,12 @@ def test_a_bent_joint_remembers_how_it_has_moved(yields, move, tolerance):
 
 
 @pytest.mark.parametrize(
-    ("effect", "values"), [("actuator_gain", [2.0]), ("actuator_lag", [0.04]), ("back_emf", [0.1, 0.4])]
+    ("effect", "values"),
+    [
+        ("actuator_gain", [2.0]),
+        pytest.param("actuator_lag", [0.04], marks=pytest.mark.slow),
+        ("back_emf", [0.1, 0.4]),
+    ],
 )
 def test_a_rotor_remembers_what_arrived_of_commands(effect, values):
     """A soft drive, bent by what its motor exerts, which is not what was commanded."""

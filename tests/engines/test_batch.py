@@ -45,6 +45,7 @@ def test_barriers_hold_where_a_step_solves_for_friction(last, request):
     assert ("opt-barrier" in compiled.as_text()) == ("dry_arm" in request.node.name)
 
 
+@pytest.mark.slow
 def test_jacobians_of_a_batch_are_those_of_each(last):
     compiled, placed = compile_spread(forward_jacobians(last, jnp.eye(2)), THETAS, out_axes=(0, 1))
     values, tangents = compiled(*placed)

@@ -49,6 +49,7 @@ def holds(levels, asked, slack):
     return abs(float((levels <= asked).mean()) - asked) < slack
 
 
+@pytest.mark.slow
 def test_flat_directions_of_a_box_come_out_flat():
     """Nothing is known of the first parameter; its moments say so with a Gaussian, which the box then cuts."""
     keys = jax.random.split(jax.random.key(0), 4)

@@ -152,7 +152,7 @@ def test_one_key_is_one_round_and_it_is_traced_once(name, actions):
     assert info.length_mean == 20
 
 
-@pytest.mark.parametrize("name", ["ppo", "sac"])
+@pytest.mark.parametrize("name", ["ppo", pytest.param("sac", marks=pytest.mark.slow)])
 def test_seeds_and_learning_rates_batch(name):
     learner, state, step = case(name, None)
     rates = jnp.array([1e-3, 1e-2, 1e-3])

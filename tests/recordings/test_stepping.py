@@ -126,6 +126,7 @@ def test_without_velocities_the_step_is_what_is_believed_of_any(tmp_path):
     assert ratio_of_motion(model, split_windows(model)[0]) == pytest.approx((RATIO.a, RATIO.b))
 
 
+@pytest.mark.slow
 def test_missing_physics_are_not_taken_for_a_step(tmp_path):
     """Fitted, s would be six: a viscous friction that the simulator lacks."""
     sealed = {"strength": 0.072, "noise": 3.0, "finer": 4, "seed": 5300029}
