@@ -15,7 +15,7 @@ print(jnp.isfinite(jax.jit(f)(x @ x.mT)))
 
 
 def test_batched_factorizations_beside_each_other_come_to_an_end():
-    # in a pool of two or four threads they hold all of them, and wait in it for each other
+    # in a pool of two threads they hold both, and wait in it for each other
     env = {name: value for name, value in os.environ.items() if name != "NPROC"}
     command = [sys.executable, "-c", FACTORIZE]
     done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=True)

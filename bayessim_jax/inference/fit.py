@@ -84,24 +84,24 @@ def fit(
     batches = max(schedule.draws // schedule.batch, 1)
     total = schedule.epochs * batches
     optimizer = optax.chain(optax.clip_by_global_norm(5.0), optax.scale_by_adam())
-    # one vector of weights: with a leaf for each layer there is several times as much to compile, and to start
-    start, restore = ravel_pytree(params)
+    # one vector of weights: with a leaf for each layer there is more to compile, and to start in every update
+    start, unravel = ravel_pytree(params)
 
     def take(tree: Any, rows: Any) -> Any:
         return jax.tree.map(lambda leaf: leaf[rows], tree)
 
-    def score(weights: Array) -> Scalar:
-        return log_prob(restore(weights), take(inputs, shown), z[shown]).mean()
+    def score(flat: Array) -> Scalar:
+        return log_prob(unravel(flat), take(inputs, shown), z[shown]).mean()
 
     def update(carry: Any, rows: Any) -> Any:
-        params, opt_state, count, skipped = carry
-        loss, grads = jax.value_and_grad(lambda p: -log_prob(restore(p), take(inputs, rows), z[rows]).mean())(params)
+        flat, opt_state, count, skipped = carry
+        loss, grads = jax.value_and_grad(lambda p: -log_prob(unravel(p), take(inputs, rows), z[rows]).mean())(flat)
         rate = schedule.learning_rate * 0.5 * (1 + jnp.cos(jnp.pi * count / total))
         sound = jnp.isfinite(loss) & jnp.isfinite(optax.tree.norm(grads))
-        direction, new_opt_state = optimizer.update(grads, opt_state, params)
-        new_params = params - rate * (direction + schedule.weight_decay * params)
+        direction, new_opt_state = optimizer.update(grads, opt_state, flat)
+        new_flat = flat - rate * (direction + schedule.weight_decay * flat)
         keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(sound, a, b), new, old)  # noqa: E731
-        carry = (keep(new_params, params), keep(new_opt_state, opt_state), count + 1, skipped + ~sound)
+        carry = (keep(new_flat, flat), keep(new_opt_state, opt_state), count + 1, skipped + ~sound)
         return carry, jnp.where(sound, -loss, 0.0)
 
     def epoch(carry: Any, index: Any) -> Any:
@@ -115,7 +115,7 @@ def fit(
         done = done + schedule.check_every
         last = score(carry[0])
         better = last > best["validation"]
-        new = {"params": carry[0], "validation": last, "train": scores[-1], "epoch": done}
+        new = {"flat": carry[0], "validation": last, "train": scores[-1], "epoch": done}
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, best)
         return carry, best, done, {"validation": last, "train": scores[-1]}
 
@@ -124,11 +124,11 @@ def fit(
         return (done + schedule.check_every <= schedule.epochs) & (done - best["epoch"] < schedule.patience)
 
     low = jnp.array(-jnp.inf)
-    best = {"params": start, "validation": low, "train": low, "epoch": jnp.array(0)}
+    best = {"flat": start, "validation": low, "train": low, "epoch": jnp.array(0)}
     carry = (start, optimizer.init(start), jnp.array(0), jnp.array(0))
     loop = (carry, best, jnp.array(0), {"validation": low, "train": low})
     carry, best, done, last = jax.lax.while_loop(more, block, loop)
-    return restore(best["params"]), FitInfo(
+    return unravel(best["flat"]), FitInfo(
         log_q_train=best["train"],
         log_q_validation=best["validation"],
         best_epoch=best["epoch"],
