@@ -60,6 +60,8 @@ FOREVER = 2**30
 """More rounds than any run has."""
 SETS, FEWEST, MOST = 32_768, 1024, 4096
 """Recordings that are simulated in a round as sets, where nothing else is asked for, and how few and many sets."""
+STANDING = 2 / 3
+"""How often the belief is the better one, of it and a wider posterior that contradicts it."""
 
 
 @struct.dataclass
@@ -356,8 +358,12 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
     q = setup.estimator.posterior(estimator, history, use)
     posterior = setup.proposal.combine(state.belief, proposal, q)
     growth, gap = posterior.against(state.belief)
-    # a fit that says less than was known, and does not contradict it, leaves the belief
-    uninformed = setup.proposal.accumulate & (growth > jnp.log(1.2)) & (gap < 2.0 * thetas.shape[1])
+    # a fit that says less than was known leaves the belief; where it contradicts it, one of the two is wrong
+    agrees = gap < 2.0 * thetas.shape[1]
+    uninformed = setup.proposal.accumulate & (growth > jnp.log(1.2)) & agrees
+    if setup.proposal.accumulate and not setup.forget:
+        torn, mixed = (growth > 0.0) & ~agrees, posterior.mix(state.belief, STANDING)
+        posterior = jax.tree.map(lambda new, both: jnp.where(torn, both, new), posterior, mixed)
     stays = recordings.diverged.all() | uninformed
     belief = jax.tree.map(lambda old, new: jnp.where(stays, old, new), state.belief, posterior)
     learner, learning = setup.learner.step(learn_key, state.learner, belief)

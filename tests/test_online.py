@@ -282,7 +282,7 @@ def test_a_system_says_what_networks_read_of_it():
     assert state.estimator.feature_mean.shape == (3,)
 
 
-def test_a_wider_posterior_that_agrees_leaves_the_belief_and_one_that_disagrees_replaces_it(small):
+def test_a_wider_posterior_that_agrees_leaves_the_belief_and_one_that_disagrees_is_mixed_with_it(small):
     setup, target = small
     box = setup.system.parameters
 
@@ -304,11 +304,18 @@ def test_a_wider_posterior_that_agrees_leaves_the_belief_and_one_that_disagrees_
     state = start(jax.random.key(0), setup).replace(belief=known)
     recordings = record(jax.random.key(1), setup, target, state)
     quickly = jax.jit(online.update)
-    for mean, sd, stays in [(0.52, 0.05, True), (0.8, 0.05, False), (0.52, 0.01, False)]:
+    for mean, sd, share in [(0.52, 0.05, 1.0), (0.8, 0.05, 2 / 3), (0.52, 0.01, 0.0), (0.8, 0.01, 0.0)]:
         given = setup.replace(proposal=Given(answer=belief(mean, sd)))
         after, info = quickly(jax.random.key(2), given, state, recordings)
-        assert bool(info.uninformed) == stays
-        assert _same(after.belief, known if stays else given.proposal.answer)
+        assert bool(info.uninformed) == (share == 1.0)
+        for expected, whole in [(known, 1.0), (given.proposal.answer, 0.0)]:
+            assert share != whole or _same(after.belief, expected)
+        expected = (1 - share) * given.proposal.answer.mean() + share * known.mean()
+        assert jnp.allclose(after.belief.mean(), expected, atol=1e-5)
+    # a machine that may have changed is what the newest recordings say
+    given = setup.replace(forget=0.1, proposal=Given(answer=belief(0.8, 0.05)))
+    after, _ = quickly(jax.random.key(2), given, state, recordings)
+    assert _same(after.belief, given.proposal.answer)
 
 
 def test_recordings_that_are_replayed_are_those_of_the_truth():

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from bayessim_jax.beliefs.algebra import reduce
 from bayessim_jax.beliefs.box_probability import box_probability, condition, lattice
 from bayessim_jax.beliefs.mixture import GaussianMixture
 from bayessim_jax.beliefs.triangular import factor, log_normal
@@ -19,6 +20,7 @@ __all__ = ["Truncated"]
 
 _CANDIDATES = 32
 _POINTS = 1024
+_LEAST = -80.0
 
 
 @struct.dataclass
@@ -116,6 +118,34 @@ class Truncated:
         log_ratio = 0.5 * (jnp.linalg.slogdet(after)[1] - jnp.linalg.slogdet(before.covariance())[1])
         return log_ratio, gap @ jnp.linalg.solve(after, gap)
 
+    def mix(self, other: Truncated, share: float | Scalar) -> Truncated:
+        """(1 − share) p + share p′, p′ the other belief on the same box, in as many components as this one has.
+
+        Those that lie nearest each other are merged, weighed by their mass in the box, which stays theirs.
+
+        Source: Stone 1961
+        """
+
+        def part(belief: Truncated, weight: float | Scalar) -> GaussianMixture:
+            inside = belief.log_shares - belief.log_mass()
+            return replace(belief.mixture, log_weights=inside + _log(weight * (1 - belief.prior_share)))
+
+        gap = other.center - self.center
+        between = share * (1 - share) * jnp.outer(gap, gap)
+        both = jax.tree.map(lambda *x: jnp.concatenate(x), part(self, 1 - share), part(other, share))
+        merged = reduce(both, self.log_shares.size)
+        held = jax.nn.logsumexp(_spread(merged, self.box)[0], axis=1) - jnp.log(float(_POINTS))
+        log_weights = merged.log_weights - jnp.maximum(held, _LEAST)
+        total = jax.nn.logsumexp(log_weights)
+        return Truncated(
+            replace(merged, log_weights=log_weights - total),
+            self.box,
+            (1 - share) * self.prior_share + share * other.prior_share,
+            merged.log_weights - total,
+            self.center + share * gap,
+            (1 - share) * self.scatter + share * other.scatter + between,
+        )
+
     def loosen(self, share: float | Scalar) -> Truncated:
         """(1 − share) p + share U(θ; box): θ may have been drawn anew from the prior, with that probability."""
         flat = Truncated.uniform(self.box, self.log_shares.size)
@@ -184,8 +214,9 @@ def _pick(u: Scalar, log_weights: Float[Array, " n"]) -> Int[Array, ""]:
     return jnp.minimum((ladder <= u * ladder[-1]).sum(), log_weights.size - 1)
 
 
-def _log(share: Scalar) -> Scalar:
+def _log(share: float | Scalar) -> Scalar:
     """The log of a share, −∞ at zero with a derivative of zero."""
+    share = jnp.asarray(share)
     return jnp.where(share > 0, jnp.log(jnp.where(share > 0, share, 1.0)), -jnp.inf)
 
 

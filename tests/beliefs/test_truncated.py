@@ -167,3 +167,35 @@ def test_log_prob_has_finite_derivatives():
     belief = create(mixture(*CASES["far outside"]), PLANE, 0.0)
     grads = jax.jit(jax.grad(lambda b, t: b.log_prob(t), (0, 1)))(belief, jnp.array([0.5, 0.5]))
     assert all(jnp.isfinite(g).all() for g in jax.tree.leaves(grads))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_a_mixed_belief_is_both_by_their_shares(share):
+    box = PLANE
+    near = mixture(box, [(0.2, 0.8), (0.21, 0.79)], [0.05, 0.05])
+    beyond = mixture(box, [(1.3, 0.2), (1.32, 0.21)], [0.1, 0.1])
+    points = box.low + jnp.array([[0.2, 0.8], [0.22, 0.78], [0.98, 0.2], [0.95, 0.2]]) * box.width
+
+    @jax.jit
+    def compare(share):
+        one, other = Truncated.create(near, box), Truncated.create(beyond, box)
+        mixed = one.mix(other, share)
+        exact = [jax.vmap(belief.log_prob)(points) for belief in (one, other)]
+        again = Truncated.create(mixed.mixture, box)
+        return jax.vmap(mixed.log_prob)(points), exact, (one.mean(), other.mean(), mixed.mean()), again, mixed
+
+    mixed, exact, means, again, whole = compare(share)
+    expected = (1 - share) * np.exp(exact[0]) + share * np.exp(exact[1])
+    np.testing.assert_allclose(np.exp(mixed), expected, rtol=0.1, atol=0.02)
+    np.testing.assert_allclose(means[2], (1 - share) * means[0] + share * means[1], atol=1e-5)
+    np.testing.assert_allclose(whole.log_mass(), again.log_mass(), atol=1e-3)
+    np.testing.assert_allclose(whole.mean(), again.mean(), atol=0.02)
+    np.testing.assert_allclose(whole.covariance(), again.covariance(), atol=0.02)
+
+
+def test_a_belief_mixed_with_the_prior_is_loosened():
+    belief = Truncated.create(mixture(PLANE, [(0.4, 0.5), (0.6, 0.3)], [0.05, 0.1]), PLANE)
+    mixed, loose = belief.mix(Truncated.uniform(PLANE, 2), 0.25), belief.loosen(0.25)
+    points = PLANE.low + jnp.array([[0.4, 0.5], [0.9, 0.9]]) * PLANE.width
+    np.testing.assert_allclose(many_log_probs(mixed, points), many_log_probs(loose, points), atol=1e-3)
+    np.testing.assert_allclose(mixed.covariance(), loose.covariance(), rtol=1e-5)
