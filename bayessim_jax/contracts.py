@@ -239,12 +239,13 @@ class Estimator(Protocol[E]):
         use: Bool[Array, " set"],
         box: Box,
         correct: bool = True,
-    ) -> tuple[E, Any]:
+    ) -> tuple[E, Any, Any]:
         """Correct the posterior of sets on sets that were never trained on (leading axes of recordings: n, set).
 
         The correction is for sets like `observed`; `use` says which recordings count, in it and in the others. `box` is
         the prior's support, to which posteriors are cut before they are judged. Without `correct` the posterior is only
-        judged. Info holds `coverage50`, `coverage90`, `overconfident` and `collapsed`.
+        judged. Info holds `coverage50`, `coverage90`, `overconfident` and `collapsed`; after it stands the posterior of
+        `observed`.
         """
         ...
 

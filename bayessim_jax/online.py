@@ -312,9 +312,7 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
     # barriers: what the compiler makes of a round does not depend on what stands around it, so that a round in a scan
     # and one called by itself are the same to the last bit
     state, recordings = jax.lax.optimization_barrier((state, recordings))
-    draw_key, simulate_key, fit_key, calibrate_key, learn_key = jax.random.split(
-        jax.random.fold_in(key, state.round), 5
-    )
+    draw_key, slot_key, simulate_key, sets_key, fit_key, calibrate_key, learn_key = _keys(key, state)
     policy = RecordedActions(recordings.actions) if setup.replay else setup.learner.policy(state.learner)
     done = state.round - setup.warmup
     history, policies, use, newest = _remember(state, done, recordings, policy)
@@ -324,7 +322,6 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
     proposal = setup.proposal.propose(known)
     fresh = setup.simulations
     thetas = jax.vmap(proposal.sample)(jax.random.split(draw_key, fresh + setup.calibrations))
-    slot_key, simulate_key = jax.random.split(simulate_key)
     earlier = jax.random.categorical(slot_key, jnp.where(use, 0.0, -jnp.inf), shape=(fresh,))
     slots = jnp.where(jnp.arange(fresh) % 2 == 0, newest, jnp.where(use.any(), earlier, newest))
     simulated = simulate(simulate_key, setup, policies, thetas[:fresh], slots)
@@ -341,9 +338,9 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
         use = use & _agree(setup, estimator, history, newest)
 
     # the posterior of everything the target has shown, calibrated on sets made under the same policies
-    set_keys = jax.random.split(jax.random.fold_in(calibrate_key, 0), use.size)
+    set_keys = jax.random.split(sets_key, use.size)
     sets = jax.vmap(lambda k, p: simulate(k, setup, p, thetas[fresh:]), out_axes=1)(set_keys, policies)
-    estimator, calibration = setup.estimator.calibrate(
+    estimator, calibration, q = setup.estimator.calibrate(
         calibrate_key,
         estimator,
         thetas[fresh:],
@@ -355,7 +352,6 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
     )
     first, served = jax.tree.map(lambda leaf: leaf[: state.sets.thetas.shape[1]], (thetas[fresh:], sets))
     kept = _insert(state.sets, done, first, served, proposal, use)
-    q = setup.estimator.posterior(estimator, history, use)
     posterior = setup.proposal.combine(state.belief, proposal, q)
     growth, gap = posterior.against(state.belief)
     # a fit that says less than was known leaves the belief; where it contradicts it, one of the two is wrong
@@ -393,7 +389,7 @@ def improve(key: PRNGKeyArray, setup: Setup, state: State) -> tuple[State, Round
     What its Info says of recordings, fit and calibration is zero, and NaN where that could be taken for a result.
     """
     state = jax.lax.optimization_barrier(state)
-    *_, learn_key = jax.random.split(jax.random.fold_in(key, state.round), 5)
+    *_, learn_key = _keys(key, state)
     learner, learning = setup.learner.step(learn_key, state.learner, state.belief)
     one = jax.tree.map(lambda leaf: leaf[: setup.recordings], state.history)
     shape = jax.eval_shape(lambda s, r: update(key, setup, s, r)[1], state, one)
@@ -428,6 +424,11 @@ def run(
         return state, replace(info, **evaluate(keys.evaluate, setup, target, state))
 
     return jax.lax.scan(one_round, init(keys.init, setup) if state is None else state, None, length=rounds)
+
+
+def _keys(key: PRNGKeyArray, state: State) -> PRNGKeyArray:
+    """Of everything in a round that is random."""
+    return jax.random.split(jax.random.fold_in(key, state.round), 7)
 
 
 def _insert(pool: Pool, done: Array, thetas: Array, recordings: Recording, proposal: Any, there: Array) -> Pool:

@@ -28,27 +28,24 @@ def rollout(
 
     Without a task no reward is paid and no episode ends early. θ is traced: a new posterior never recompiles.
     """
-    reset_key, noise_key, step_key = jax.random.split(key, 3)
+    reset_key, noise_key, act_key = jax.random.split(key, 3)
     state = system.reset(reset_key, theta)
+    noise = system.noise * jax.random.normal(noise_key, (steps + 1, system.observations.size), system.noise.dtype)
 
-    def sense(state: Any, key: PRNGKeyArray) -> Float[Array, " obs"]:
-        clean = system.observe(theta, state)
-        return clean + system.noise * jax.random.normal(key, clean.shape, clean.dtype)
-
-    def step(carry: Any, key: PRNGKeyArray) -> Any:
+    def step(carry: Any, x: Any) -> Any:
         state, observation, memory, running = carry
-        act_key, noise_key = jax.random.split(key)
-        action, memory = policy.act(act_key, memory, observation)
+        key, noise = x
+        action, memory = policy.act(key, memory, observation)
         next_state = system.step(theta, state, action)
-        next_observation = sense(next_state, noise_key)
+        next_observation = system.observe(theta, next_state) + noise
         reward = jnp.zeros(()) if task is None else task.reward(state, action, next_state)
         ends = jnp.array(False) if task is None else task.terminated(next_state)
         output = (next_observation, action, reward, running)
         return (next_state, next_observation, memory, running & ~ends), output
 
-    observation = sense(state, noise_key)
+    observation = system.observe(theta, state) + noise[0]
     carry = (state, observation, policy.init(), jnp.array(True))
-    _, (later, actions, rewards, valid) = jax.lax.scan(step, carry, jax.random.split(step_key, steps))
+    _, (later, actions, rewards, valid) = jax.lax.scan(step, carry, (jax.random.split(act_key, steps), noise[1:]))
     return assemble(system.dt, jnp.concatenate([observation[None], later]), actions, rewards, valid)
 
 
@@ -62,7 +59,8 @@ def assemble(
     """Pad what came after the end with zeros, and mask everything from the first non-finite number on."""
     finite = jnp.isfinite(observations).all(-1)
     sound = finite[:-1] & finite[1:] & jnp.isfinite(actions).all(-1) & jnp.isfinite(rewards)
-    kept = valid & (jnp.cumsum(~sound) == 0)
+    steps = jnp.arange(valid.size)
+    kept = valid & (steps < jnp.where(sound, valid.size, steps).min())
     seen = jnp.concatenate([kept[:1], kept])
     zero: Callable[[Any, Any], Any] = lambda mask, x: jnp.where(mask, x, jnp.zeros_like(x))  # noqa: E731
     return Recording(

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from bayessim_jax.beliefs.algebra import reduce
 from bayessim_jax.beliefs.box_probability import box_probability, condition, lattice
 from bayessim_jax.beliefs.mixture import GaussianMixture
-from bayessim_jax.beliefs.triangular import factor, log_normal
+from bayessim_jax.beliefs.triangular import factor, log_normal, solve_positive
 from bayessim_jax.contracts import Box, Scalar
 
 __all__ = ["Truncated"]
@@ -116,7 +116,7 @@ class Truncated:
         """The log of its volume over an earlier belief's, and the squared distance of their means in its own widths."""
         after, gap = self.covariance(), self.mean() - before.mean()
         log_ratio = 0.5 * (jnp.linalg.slogdet(after)[1] - jnp.linalg.slogdet(before.covariance())[1])
-        return log_ratio, gap @ jnp.linalg.solve(after, gap)
+        return log_ratio, gap @ solve_positive(after, gap[:, None])[:, 0]
 
     def mix(self, other: Truncated, share: float | Scalar) -> Truncated:
         """(1 − share) p + share p′, p′ the other belief on the same box, in as many components as this one has.

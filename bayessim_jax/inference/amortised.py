@@ -241,5 +241,5 @@ def _learn(
     trained, judged = (jax.tree.map(lambda leaf, part=part: leaf[part], sets) for part in _PARTS)
     state = estimator.init(init_key, one, points.shape[1])
     state, _ = estimator.fit(fit_key, state, points[_PARTS[0]], trained, jnp.ones(SIMULATIONS))
-    state, info = estimator.calibrate(calibrate_key, state, points[_PARTS[1]], judged, one, use, belief.box)
-    return TruncatedPrior().combine(belief, proposal, estimator.posterior(state, one, use)), info
+    _, info, q = estimator.calibrate(calibrate_key, state, points[_PARTS[1]], judged, one, use, belief.box)
+    return TruncatedPrior().combine(belief, proposal, q), info

@@ -6,14 +6,17 @@ observations, their finite differences, the action, and whether the step happene
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from bayessim_jax.chance import draw
 from bayessim_jax.contracts import Recording
 from bayessim_jax.spelling import find_named
 
@@ -75,10 +78,11 @@ def pool(
     return mean, on.any(-1)
 
 
-def glorot(key: PRNGKeyArray, rows: int, columns: int) -> Float[Array, "rows columns"]:
-    """Uniform weights with variance 2/(rows + columns)."""
-    limit = jnp.sqrt(6.0 / (rows + columns))
-    return jax.random.uniform(key, (rows, columns), minval=-limit, maxval=limit)
+def glorot(key: PRNGKeyArray, *shapes: tuple[int, int]) -> list[Float[Array, "rows columns"]]:
+    """Uniform weights with variance 2/(rows + columns), for each of these (rows, columns)."""
+    sizes = [math.prod(shape) for shape in shapes]
+    parts = jnp.split(2.0 * draw(key, (sum(sizes),)) - 1.0, np.cumsum(sizes[:-1]))
+    return [math.sqrt(6.0 / sum(shape)) * part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
 
 
 @struct.dataclass
@@ -103,12 +107,12 @@ class Lstm:
 
     def init(self, key: PRNGKeyArray, features: int) -> dict[str, Any]:
         """Glorot weights, and a forget gate that starts open."""
-        w_key, u_key, *keys = jax.random.split(key, 2 + len(self.widths))
-        h = self.size
+        h, shapes = self.size, _shapes(features, self.widths)
+        w, u, *read = glorot(key, ((features, *self.widths)[-1], 4 * h), (h, 4 * h), *shapes)
         return {
-            "read": _layers(keys, features, self.widths),
-            "w": glorot(w_key, (features, *self.widths)[-1], 4 * h),
-            "u": glorot(u_key, h, 4 * h),
+            "read": [_dense(weights) for weights in read],
+            "w": w,
+            "u": u,
             "b": jnp.zeros(4 * h).at[h : 2 * h].set(1.0),
         }
 
@@ -204,13 +208,9 @@ class Attention:
 
     def init(self, key: PRNGKeyArray, features: int) -> dict[str, Any]:
         """Glorot weights; small ones for the scores, so that all steps count alike at first."""
-        score_key, value_key, *keys = jax.random.split(key, 2 + len(self.widths))
-        size = (self.widths or (features,))[-1]
-        return {
-            "read": _layers(keys, features, self.widths),
-            "score": jax.tree.map(lambda leaf: 0.1 * leaf, _dense(score_key, size, self.heads)),
-            "value": _dense(value_key, size, self.heads * self.values),
-        }
+        size, shapes = (features, *self.widths)[-1], _shapes(features, self.widths)
+        score, value, *read = glorot(key, (size, self.heads), (size, self.heads * self.values), *shapes)
+        return {"read": [_dense(weights) for weights in read], "score": _dense(0.1 * score), "value": _dense(value)}
 
     def apply(
         self, params: Any, x: Float[Array, "batch steps features"], valid: Bool[Array, "batch steps"]
@@ -224,12 +224,13 @@ class Attention:
         return jnp.concatenate([means.reshape(x.shape[0], -1), jax.nn.logsumexp(scores, axis=1)], axis=-1)
 
 
-def _dense(key: PRNGKeyArray, rows: int, columns: int) -> dict[str, Array]:
-    return {"w": glorot(key, rows, columns), "b": jnp.zeros(columns)}
+def _dense(weights: Float[Array, "rows columns"]) -> dict[str, Array]:
+    return {"w": weights, "b": jnp.zeros(weights.shape[1])}
 
 
-def _layers(keys: Sequence[PRNGKeyArray], features: int, widths: tuple[int, ...]) -> list[dict[str, Array]]:
-    return [_dense(key, a, b) for key, a, b in zip(keys, (features, *widths), widths, strict=False)]
+def _shapes(features: int, widths: tuple[int, ...]) -> list[tuple[int, int]]:
+    """Of the layers that read each step."""
+    return list(zip((features, *widths), widths, strict=False))
 
 
 def _read(layers: list[dict[str, Array]], x: Float[Array, "*n features"]) -> Float[Array, "*n size"]:

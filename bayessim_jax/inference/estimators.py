@@ -151,8 +151,10 @@ class MixtureDensity:
         use: Bool[Array, " set"],
         box: Box,
         correct: bool = True,
-    ) -> tuple[EstimatorState, CalibrationInfo]:
+    ) -> tuple[EstimatorState, CalibrationInfo, GaussianMixture]:
         """Measure the posterior of sets on sets that no network has seen, and take out what is wrong with it.
+
+        Returns the posterior of the set observed, too: what `posterior` says of it after this.
 
         In what is reported the half of them whose posteriors sit nearest that of the set observed counts, the nearest
         most; and in the correction, where it is that of single recordings.
@@ -169,14 +171,16 @@ class MixtureDensity:
 
         if not correct:
             before = levels(z.shape[0])
-            return state, judge(before, before, weights, z.shape[1], jnp.ones(()))
+            info = judge(before, before, weights, z.shape[1], jnp.ones(()))
+            return state, info, state.correction.apply(seen).affine(state.shift, state.scale)
         if isinstance(state.correction, Readout):
             correction, after = read_sets(key, plain, z, low, high)
         else:
             correction, after = recalibrate(key, plain, z, weights, low, high)
-        widen = _width(correction.apply(seen)) / _width(seen)
+        corrected = correction.apply(seen)
+        widen = _width(corrected) / _width(seen)
         info = judge(levels(after.size), after, by_number(weights[: after.size]), z.shape[1], widen)
-        return replace(state, correction=correction), info
+        return replace(state, correction=correction), info, corrected.affine(state.shift, state.scale)
 
     def posterior(self, state: EstimatorState, recordings: Recording, use: Bool[Array, " set"]) -> GaussianMixture:
         """The mixture q(θ | recordings in use), for one set, in the units of θ."""

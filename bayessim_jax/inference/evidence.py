@@ -34,6 +34,7 @@ def combine_evidence(each: GaussianMixture, use: Bool[Array, " set"]) -> Gaussia
 
     j, h = jax.vmap(evidence)(each)
     precision = jnp.eye(h.shape[-1]) + jnp.where(use[:, None, None], j, 0.0).sum(0)
-    covariance = jnp.linalg.inv(precision)
-    mean = covariance @ jnp.where(use[:, None], h, 0.0).sum(0)
-    return GaussianMixture(jnp.zeros(1), mean[None], jnp.linalg.cholesky(covariance)[None])
+    # Λ = U Uᵀ, U upper triangular, from the factor of Λ read backwards; Λ⁻¹ = U⁻ᵀ U⁻¹
+    root = jnp.flip(invert(jnp.linalg.cholesky(jnp.flip(precision)))).T
+    mean = root @ (root.T @ jnp.where(use[:, None], h, 0.0).sum(0))
+    return GaussianMixture(jnp.zeros(1), mean[None], root[None])

@@ -11,6 +11,7 @@ from flax import struct
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from bayessim_jax.chance import draw
 from bayessim_jax.contracts import Scalar
 
 if TYPE_CHECKING:
@@ -53,13 +54,13 @@ class FitInfo:
     """Updates skipped because loss or gradient was not finite."""
 
 
-def systematic(key: PRNGKeyArray, weights: Float[Array, " n"], draws: int) -> Int[Array, " draws"]:
-    """Indices in proportion to weights with the least possible variance, in random order."""
-    uniforms = jax.random.uniform(key, (1 + draws,))
+def systematic(uniform: Float[Array, " 1+draws"], weights: Float[Array, " n"]) -> Int[Array, " draws"]:
+    """Indices in proportion to weights with the least possible variance, in random order, from uniform numbers."""
+    draws = uniform.size - 1
     cumulative = jnp.cumsum(weights)
-    points = (jnp.arange(draws) + uniforms[0]) / draws * cumulative[-1]
+    points = (jnp.arange(draws) + uniform[0]) / draws * cumulative[-1]
     picks = jnp.clip(jnp.searchsorted(cumulative, points), 0, weights.size - 1)
-    return picks[jnp.argsort(uniforms[1:])]
+    return picks[jnp.argsort(uniform[1:])]
 
 
 def fit(
@@ -78,10 +79,11 @@ def fit(
     trained on; callers hold out the same rows in every round, so that warm weights have not seen them. A batch whose
     loss or gradient is not finite is skipped and counted. Training stops when nothing improved for `patience` epochs.
     """
-    validate_key, epochs_key = jax.random.split(key)
-    train_weights = jnp.where(held_out, 0.0, weights)
-    shown = systematic(validate_key, jnp.where(held_out, weights, 0.0), min(schedule.validation_draws, z.shape[0]))
     batches = max(schedule.draws // schedule.batch, 1)
+    drawn, looked_at = batches * schedule.batch, min(schedule.validation_draws, z.shape[0])
+    uniform = draw(key, (1 + schedule.epochs, 1 + max(drawn, looked_at)))
+    train_weights = jnp.where(held_out, 0.0, weights)
+    shown = systematic(uniform[-1, : 1 + looked_at], jnp.where(held_out, weights, 0.0))
     total = schedule.epochs * batches
     optimizer = optax.chain(optax.clip_by_global_norm(5.0), optax.scale_by_adam())
     # one vector of weights: with a leaf for each layer there is more to compile, and to start in every update
@@ -105,7 +107,7 @@ def fit(
         return carry, jnp.where(sound, -loss, 0.0)
 
     def epoch(carry: Any, index: Any) -> Any:
-        rows = systematic(jax.random.fold_in(epochs_key, index), train_weights, batches * schedule.batch)
+        rows = systematic(uniform[index, : 1 + drawn], train_weights)
         carry, scores = jax.lax.scan(update, carry, rows.reshape(batches, schedule.batch))
         return carry, scores.mean()
 

@@ -37,19 +37,20 @@ class MixtureHead:
 
     def init(self, key: PRNGKeyArray, inputs: int, d: int) -> dict[str, Array]:
         """Small output weights, and means spread over the unit ball so that components differ."""
-        k1, k2, k3 = jax.random.split(key, 3)
+        mean_key, weights_key = jax.random.split(key)
         k, width = self.components, self.hidden or inputs
         below = d * (d - 1) // 2
+        out, *hidden = glorot(
+            weights_key, (width, k * (1 + 2 * d + below)), *([(inputs, width)] if self.hidden else [])
+        )
         params = {
             "logits": jnp.zeros(k),
-            "mean": 0.7 * jax.random.normal(k3, (k, d)),
+            "mean": 0.7 * jax.random.normal(mean_key, (k, d)),
             "log_diagonal": jnp.zeros((k, d)),
             "below": jnp.zeros((k, below)),
-            "out": 0.1 * glorot(k2, width, k * (1 + 2 * d + below)),
+            "out": 0.1 * out,
         }
-        if self.hidden:
-            params |= {"w": glorot(k1, inputs, width), "b": jnp.zeros(width)}
-        return params
+        return params | ({"w": hidden[0], "b": jnp.zeros(width)} if self.hidden else {})
 
     def apply(self, params: Any, x: Float[Array, "*n inputs"]) -> tuple[Array, Array, Array]:
         """Log weights (*n, K), means (*n, K, d) and precision factors A (*n, K, d, d)."""

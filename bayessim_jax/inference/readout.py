@@ -86,10 +86,10 @@ def read_sets(
     conditional density estimation: `regress` takes out what is linear, and networks learn the law of what is left. A
     network that predicts the sets that it did not see no better than N(0, I) does, by more than the standard error of
     the difference, is left at N(0, I). Of `SCALES` the one is taken at which credible sets that are cut to the box
-    hold their share of the truths, for sets that a network has not seen.
+    hold their share of the truths: those of the average of the networks, which is wider than each where they differ,
+    for sets that one of them and the regression have not seen.
 
-    Returns the readout, and the credible levels of the truths of the first sets, those that one of the networks holds
-    out, as this network says.
+    Returns the readout, and the credible levels of the truths of these sets, the first ones.
 
     Source: Blum and François 2010; Papamakarios and Murray 2016
     """
@@ -136,11 +136,8 @@ def read_sets(
     readout = replace(readout, params=params)
 
     held = -(-n * MEMBERS // FOLDS)
-    own, sets, z = (
-        jax.tree.map(lambda leaf: leaf[part[:held]], params),
-        *jax.tree.map(lambda leaf: leaf[:held], (evidence, truths)),
-    )
-    levels = credible_levels(level_key, jax.vmap(readout.said)(own, sets), z, low, high, jnp.array(SCALES))
+    sets, z = jax.tree.map(lambda leaf: leaf[:held], (evidence, truths))
+    levels = credible_levels(level_key, jax.vmap(readout.apply)(sets), z, low, high, jnp.array(SCALES))
     best = best_scale(levels, jnp.ones(held))
     return replace(readout, scale=jnp.array(SCALES)[best]), levels[:, best]
 

@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from scipy.special import chdtr, chdtri
 
 from bayessim_jax.beliefs import GaussianMixture, moment_match
-from bayessim_jax.beliefs.triangular import invert, solve_lower
+from bayessim_jax.beliefs.triangular import invert, solve_lower, solve_positive
+from bayessim_jax.chance import draw
 from bayessim_jax.contracts import Scalar
 
 __all__ = [
@@ -139,8 +140,9 @@ def regress(
     def solve(w: Array) -> tuple[Array, Array, Array]:
         gram = (x * w[:, None]).T @ x
         ridge = gram + pseudo * jnp.eye(1 + d)
-        slopes = jnp.linalg.solve(ridge, (x * w[:, None]).T @ r)
-        return slopes, r - x @ slopes, jnp.trace(jnp.linalg.solve(ridge, gram))
+        solved = solve_positive(ridge, jnp.concatenate([(x * w[:, None]).T @ r, gram], axis=1))
+        slopes = solved[:, : r.shape[1]]
+        return slopes, r - x @ slopes, jnp.trace(solved[:, r.shape[1] :])
 
     _, left, _ = solve(weights)
     spread = jnp.sqrt((share * left**2).sum(0))
@@ -206,8 +208,8 @@ def credible_levels(
     `low` to `high`; the level is estimated from the draws that fall in it, the same ones for every factor.
     """
 
-    def one(key: PRNGKeyArray, mixture: GaussianMixture, truth: Array) -> Array:
-        samples = jax.vmap(mixture.sample)(jax.random.split(key, draws))
+    def one(uniform: Array, mixture: GaussianMixture, truth: Array) -> Array:
+        samples = jax.vmap(mixture.made_of)(uniform)
         densities, mean = jax.vmap(mixture.log_prob)(samples), mixture.mean()
 
         def at(scale: Scalar) -> Scalar:
@@ -218,7 +220,8 @@ def credible_levels(
 
         return jax.vmap(at)(scales)
 
-    return jax.vmap(one)(jax.random.split(key, truths.shape[0]), mixtures, truths)
+    n, d = truths.shape
+    return jax.vmap(one)(draw(key, (n, draws, 1 + d)), mixtures, truths)
 
 
 def judge(

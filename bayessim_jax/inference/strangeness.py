@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from bayessim_jax.beliefs.triangular import solve_positive
 from bayessim_jax.contracts import Recording, Scalar
 
 __all__ = ["STRANGE", "strangeness"]
@@ -106,7 +107,7 @@ def _least_squares(
     """Slopes of y on x, held by a ridge of so much for every row that is not zero."""
     rows = jnp.maximum(x[..., 0].sum(-1), 1.0)[..., None, None]
     gram = jnp.einsum("...ti,...tj->...ij", x, x) + ridge * rows * jnp.eye(x.shape[-1])
-    return jnp.linalg.solve(gram, jnp.einsum("...ti,...tj->...ij", x, y))
+    return solve_positive(gram, jnp.einsum("...ti,...tj->...ij", x, y))
 
 
 def _summarize(x: Array, moves: Array, slopes: Array) -> Float[Array, "*batch k"]:

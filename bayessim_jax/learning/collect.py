@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from bayessim_jax.chance import draw, normal
 from bayessim_jax.contracts import Belief, Scalar, System, Task
-from bayessim_jax.learning.heads import Actor, draw, normal
+from bayessim_jax.learning.heads import Actor
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -6,14 +6,14 @@ takes. Noise is an argument, so that a learner can draw it for a whole round at 
 
 from __future__ import annotations
 
-import math
 from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
+from bayessim_jax.chance import normal
 from bayessim_jax.contracts import Box, Discrete, Scalar
 
 __all__ = [
@@ -24,8 +24,6 @@ __all__ = [
     "Head",
     "SquashedGaussian",
     "choose_head",
-    "draw",
-    "normal",
 ]
 
 _HALF_LOG_2PI = 0.9189385332046727
@@ -251,16 +249,6 @@ class Explorer:
     def action(self, raw: Float[Array, " act"]) -> Float[Array, " act"]:
         """Stretched to the box, in its units."""
         return _to_box(self.box, raw)
-
-
-def draw(key: PRNGKeyArray, shape: tuple[int, ...]) -> Array:
-    """Uniform numbers in (0, 1), neither end included; drawn as one line, which compiles several times faster."""
-    return jax.random.uniform(key, (math.prod(shape),), minval=1e-7).reshape(shape)
-
-
-def normal(uniform: Any) -> Any:
-    """The standard normal number that a uniform one in (0, 1) is the quantile of."""
-    return jax.scipy.special.ndtri(uniform)
 
 
 def choose_head(actions: Box | Discrete) -> Categorical | Gaussian:

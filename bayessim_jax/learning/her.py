@@ -13,9 +13,10 @@ import optax
 from flax import struct
 from jaxtyping import Array, Int, PRNGKeyArray
 
+from bayessim_jax.chance import draw, normal
 from bayessim_jax.contracts import Belief, Box, GoalTask, Scalar, System, Task
 from bayessim_jax.learning.collect import Transitions, blank, collect
-from bayessim_jax.learning.heads import Explorer, draw, normal
+from bayessim_jax.learning.heads import Explorer
 from bayessim_jax.learning.networks import Mlp, evaluate_critics
 from bayessim_jax.learning.normalisation import Moments
 from bayessim_jax.learning.policies import NetworkPolicy

@@ -7,7 +7,8 @@ from typing import Any
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from bayessim_jax.learning.heads import Actor, draw
+from bayessim_jax.chance import draw
+from bayessim_jax.learning.heads import Actor
 from bayessim_jax.learning.networks import Mlp
 from bayessim_jax.learning.normalisation import Scaling
 

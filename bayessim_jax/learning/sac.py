@@ -13,9 +13,10 @@ from flax import struct
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Int, PRNGKeyArray
 
+from bayessim_jax.chance import draw
 from bayessim_jax.contracts import Belief, Box, Scalar, System, Task
 from bayessim_jax.learning.collect import Episodes, blank, collect
-from bayessim_jax.learning.heads import SquashedGaussian, draw
+from bayessim_jax.learning.heads import SquashedGaussian
 from bayessim_jax.learning.networks import Mlp, evaluate_critics
 from bayessim_jax.learning.normalisation import Scaling
 from bayessim_jax.learning.policies import NetworkPolicy

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
+from bayessim_jax.chance import draw, normal
 from bayessim_jax.contracts import Box, Discrete
-from bayessim_jax.learning.heads import Categorical, Gaussian, SquashedGaussian, choose_head, draw, normal
+from bayessim_jax.learning.heads import Categorical, Gaussian, SquashedGaussian, choose_head
 from bayessim_jax.learning.normalisation import Scaling
 
 BOX = Box.create(a=(-2.0, 6.0, "N"), b=(0.0, 1.0, "m"))
