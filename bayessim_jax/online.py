@@ -61,7 +61,7 @@ FOREVER = 2**30
 SETS, FEWEST, MOST = 32_768, 1024, 4096
 """Recordings that are simulated in a round as sets, where nothing else is asked for, and how few and many sets."""
 STANDING = 2 / 3
-"""How often the belief is the better one, of it and a wider posterior that contradicts it."""
+"""Share of the belief where a wider posterior contradicts it: more often than not it is the better one of the two."""
 
 
 @struct.dataclass

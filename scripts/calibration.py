@@ -81,7 +81,7 @@ def _row(results: Sequence[dict[str, Any]]) -> str:
     p = uniformity_test(jnp.asarray(rank * DRAWS).round(), DRAWS, bins)[1].min() if bins > 1 else float("nan")
     error = log_q.std(ddof=1) / np.sqrt(n) if n > 1 else float("nan")
     held = (f"{(level <= a).mean():.3f} ± {np.sqrt(a * (1 - a) / n):.3f}" for a in (0.5, 0.9))
-    return f"{n} | {' | '.join(held)} | {p:.2f} | {network.mean():.2f} | {log_q.mean():.2f} ± {error:.2f}"
+    return f"{n} | {' | '.join(held)} | {p:.3f} | {network.mean():.2f} | {log_q.mean():.2f} ± {error:.2f}"
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from bayessim_jax.beliefs.triangular import factor
-from bayessim_jax.chance import draw, normal
+from bayessim_jax.chance import draw, normal, pick
 from bayessim_jax.contracts import Scalar
 
 if TYPE_CHECKING:
@@ -51,12 +51,11 @@ class GaussianMixture:
 
     def sample(self, key: PRNGKeyArray) -> Float[Array, " d"]:
         """One draw of θ."""
-        return self.made_of(draw(key, (1 + self.means.shape[1],)))
+        return self.made_of(draw(key, (1 + self.means.shape[1],), self.means.dtype))
 
     def made_of(self, uniform: Float[Array, " 1+d"]) -> Float[Array, " d"]:
         """The draw of θ that independent uniform numbers in (0, 1) give."""
-        ladder = jnp.cumsum(self.weights)
-        index = jnp.minimum((ladder <= uniform[0] * ladder[-1]).sum(), ladder.size - 1)
+        index = pick(uniform[0], self.log_weights)
         return self.means[index] + self.scale_trils[index] @ normal(uniform[1:])
 
     def log_prob(self, theta: Float[Array, " d"]) -> Scalar:

@@ -8,12 +8,13 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from bayessim_jax.beliefs.algebra import reduce
 from bayessim_jax.beliefs.box_probability import box_probability, condition, lattice
 from bayessim_jax.beliefs.mixture import GaussianMixture
 from bayessim_jax.beliefs.triangular import factor, log_normal, solve_positive
+from bayessim_jax.chance import pick
 from bayessim_jax.contracts import Box, Scalar
 
 __all__ = ["Truncated"]
@@ -21,6 +22,7 @@ __all__ = ["Truncated"]
 _CANDIDATES = 32
 _POINTS = 1024
 _LEAST = -80.0
+"""The log of the least mass in the box that a merged component is taken to have."""
 
 
 @struct.dataclass
@@ -90,12 +92,12 @@ class Truncated:
         d, low, high = self.box.size, self.box.low, self.box.high
         draws = jax.random.uniform(key, (2 * d + 3,), low.dtype)
         shift, flat, (which, kept, share) = draws[:d], draws[d : 2 * d], draws[2 * d :]
-        index = _pick(which, self.log_shares)
+        index = pick(which, self.log_shares)
         edge = jnp.finfo(low.dtype).eps
         u = jnp.mod(lattice(_CANDIDATES if d > 1 else 1, d) + shift, 1.0).clip(edge, 1 - edge)
         mean, scale_tril = self.mixture.means[index], self.mixture.scale_trils[index]
         log_weights, fractions = jax.vmap(lambda v: condition(mean, scale_tril, low, high, v))(u)
-        fraction = jnp.where(share < self.prior_share, flat, fractions[_pick(kept, log_weights)])
+        fraction = jnp.where(share < self.prior_share, flat, fractions[pick(kept, log_weights)])
         return jnp.clip(low + fraction * self.box.width, jnp.nextafter(low, high), jnp.nextafter(high, low))
 
     def log_prob(self, theta: Float[Array, " d"]) -> Scalar:
@@ -206,12 +208,6 @@ def _spread(mixture: GaussianMixture, box: Box) -> tuple[Float[Array, "component
     """Points of every component in the box: their log weights, and where they lie between the bounds (0 … 1)."""
     over = jax.vmap(jax.vmap(condition, (None, None, None, None, 0)), (0, 0, None, None, None))
     return over(mixture.means, mixture.scale_trils, box.low, box.high, lattice(_POINTS, box.size))
-
-
-def _pick(u: Scalar, log_weights: Float[Array, " n"]) -> Int[Array, ""]:
-    """The index below which a share u of the weights lies."""
-    ladder = jnp.cumsum(jax.nn.softmax(log_weights))
-    return jnp.minimum((ladder <= u * ladder[-1]).sum(), log_weights.size - 1)
 
 
 def _log(share: float | Scalar) -> Scalar:

@@ -40,9 +40,10 @@ class MixtureHead:
         mean_key, weights_key = jax.random.split(key)
         k, width = self.components, self.hidden or inputs
         below = d * (d - 1) // 2
-        out, *hidden = glorot(
-            weights_key, (width, k * (1 + 2 * d + below)), *([(inputs, width)] if self.hidden else [])
-        )
+        shapes = [(width, k * (1 + 2 * d + below))]
+        if self.hidden:
+            shapes.append((inputs, width))
+        out, *hidden = glorot(weights_key, *shapes)
         params = {
             "logits": jnp.zeros(k),
             "mean": 0.7 * jax.random.normal(mean_key, (k, d)),

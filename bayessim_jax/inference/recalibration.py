@@ -221,7 +221,7 @@ def credible_levels(
         return jax.vmap(at)(scales)
 
     n, d = truths.shape
-    return jax.vmap(one)(draw(key, (n, draws, 1 + d)), mixtures, truths)
+    return jax.vmap(one)(draw(key, (n, draws, 1 + d), truths.dtype), mixtures, truths)
 
 
 def judge(

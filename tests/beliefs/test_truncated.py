@@ -174,7 +174,7 @@ def test_a_mixed_belief_is_both_by_their_shares(share):
     box = PLANE
     near = mixture(box, [(0.2, 0.8), (0.21, 0.79)], [0.05, 0.05])
     beyond = mixture(box, [(1.3, 0.2), (1.32, 0.21)], [0.1, 0.1])
-    points = box.low + jnp.array([[0.2, 0.8], [0.22, 0.78], [0.98, 0.2], [0.95, 0.2]]) * box.width
+    points = box.low + jnp.array([[0.2, 0.8], [0.22, 0.78], [0.98, 0.02], [0.99, 0.05]]) * box.width
 
     @jax.jit
     def compare(share):
