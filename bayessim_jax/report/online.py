@@ -173,9 +173,10 @@ def _calibration(run: OnlineRun) -> list[str]:
     flags = [np.nan_to_num(run.series(name)) > 0 for name in ("overfit", "overconfident")]
     svg = coverage_plot(run.series("coverage90"), run.series("log_q_train"), run.series("log_q_validation"), *flags)
     caption = (
-        "Left: how many of the simulated sets that were kept out of training lie inside their own 90 % credible set "
-        "(each half corrected by the other). Right: the score on simulations trained on and held "
-        "out; a widening gap is over-fitting. Orange crosses mark rounds that raised a flag."
+        "Left: the share of simulated sets of recordings, none of which the networks of single recordings were fitted "
+        f"to, whose true parameters lie inside their 90 % credible set{_corrected_by(run)}. Right: the score on "
+        "simulations trained on and held out; a widening gap is over-fitting. Orange crosses mark rounds that raised a "
+        "flag."
     )
     parts = [html.figure(svg, "Coverage on held-out simulations and fit scores against rounds.", caption, wide=True)]
     if run.truths is not None and len(run.seeds) > 1:
@@ -189,6 +190,15 @@ def _calibration(run: OnlineRun) -> list[str]:
         svg = rank_plot(run.vectors("rank_true")[:, -1], run.names)
         parts.append(html.figure(svg, "Histograms of the truth's rank over seeds.", caption))
     return [html.figures(*parts)]
+
+
+def _corrected_by(run: OnlineRun) -> str:
+    """What the posteriors whose coverage is shown were corrected with."""
+    if run.settings.get("proposal") == "paper":
+        return ""
+    if run.settings.get("history") == 1:
+        return ", corrected by those of the other half"
+    return "; what corrects it was learned from other sets, all but its width, which is chosen on these"
 
 
 def _next(run: OnlineRun, alarmed: bool) -> list[tuple[str, str]]:

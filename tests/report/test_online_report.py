@@ -57,6 +57,14 @@ def test_what_to_do_next_follows_from_the_run():
     assert "--seeds 8" not in cut
 
 
+def test_the_caption_of_the_coverage_says_how_the_posterior_was_corrected():
+    run = made_up(rounds=1)
+    both = "corrected by those of the other half", "its width, which is chosen on these"
+    for change, told in (({}, both[1:]), ({"history": 1}, both[:1]), ({"proposal": "paper"}, ())):
+        page = render(replace(run, settings=run.settings | change))
+        assert tuple(words for words in both if words in page) == told
+
+
 @pytest.mark.parametrize("seeds", [1, 3])
 def test_a_ground_that_changes_is_told_and_the_geometry_that_it_makes_apparent(seeds):
     run = made_up(rounds=4, seeds=seeds)
