@@ -263,7 +263,11 @@ class Learner(Protocol[L]):
         ...
 
     def step(self, key: PRNGKeyArray, state: L, belief: Belief) -> tuple[L, Any]:
-        """One round of improvement; Info holds at least `return_mean` and `nonfinite`."""
+        """One round of improvement.
+
+        Info holds at least `return_mean`, `nonfinite` (transitions that were masked) and `skipped` (updates that were
+        not taken), both because a number was not finite.
+        """
         ...
 
     def policy(self, state: L, deterministic: bool = False) -> Policy:

@@ -122,6 +122,8 @@ class Setup:
 
         `calibrations` of 0 are as many sets as make 32,768 recordings, but 1024 at least and 4096 at most: where few
         recordings are remembered, more of their sets are to be had at the same cost.
+
+        Raises `ValueError` where a number is none that a run can have.
         """
         for name, value in sizes.items():
             if value < (0 if name in ("evaluations", "warmup", "inferences", "calibrations", "kept") else 1):
@@ -131,8 +133,12 @@ class Setup:
         sizes["kept"] = min(sizes.get("kept", 0), sizes["calibrations"])
         if not 0 <= forget < 1:
             raise ValueError(f"Setup: forget is {forget}; it is a probability, from 0 to below 1.")
-        if sizes.get("history", cls.history) % sizes.get("recordings", cls.recordings):
-            raise ValueError("Setup: history must be a multiple of recordings, so that a round's set stays together.")
+        history, recordings = sizes.get("history", cls.history), sizes.get("recordings", cls.recordings)
+        if history % recordings:
+            raise ValueError(
+                f"Setup: history is {history}, no multiple of recordings, {recordings}, so a round's would not be "
+                f"forgotten together; take a history of {max(history // recordings, 1) * recordings}."
+            )
         return cls(
             system=system,
             learner=learner,
@@ -143,6 +149,11 @@ class Setup:
             forget=forget,
             **sizes,
         )
+
+    @property
+    def remembered(self) -> int:
+        """How many recordings the posterior is conditioned on: `history`, or a round's in the paper's mode."""
+        return self.history if self.proposal.accumulate else self.recordings
 
 
 @struct.dataclass
@@ -187,7 +198,7 @@ class RoundInfo:
     calibration: Any
     """The estimator's Info of the calibration: `coverage50`, `coverage90`, `widen`, `overconfident`, …."""
     learning: Any
-    """The learner's Info: at least `return_mean` and `nonfinite`."""
+    """The learner's Info: at least `return_mean`, `nonfinite` and `skipped`."""
     return_target: Scalar
     """Mean return of the evaluation episodes on the target; NaN where none is run."""
     cost_target: Scalar
@@ -195,7 +206,7 @@ class RoundInfo:
     success_target: Scalar
     """Share of them that were at their goal in the end; NaN where the task has no goal."""
     diverged: Int[Array, ""]
-    """Simulations of this round that were masked because a number was not finite."""
+    """Simulations of this round, to fit and to calibrate, that were masked because a number was not finite."""
     pool_size: Scalar
     """Effective number of simulations that the fit stood on, (Σ w)² / Σ w²."""
     uninformed: Bool[Array, ""]
@@ -231,7 +242,7 @@ def init(key: PRNGKeyArray, setup: Setup) -> State:
     idle = RecordedActions(jnp.zeros((setup.steps, setup.system.actions.size)))
     policy = idle if setup.replay else setup.learner.policy(learner)
     one = jax.eval_shape(lambda: simulate(key, setup, policy, belief.box.low[None]))
-    remembered = setup.history if setup.proposal.accumulate else setup.recordings
+    remembered = setup.remembered
     slots = setup.pool if setup.proposal.reuse else 1
 
     def empty(*axes: int) -> Recording:
@@ -281,7 +292,7 @@ def evaluate(key: PRNGKeyArray, setup: Setup, target: Target, state: State) -> d
     """How the deterministic policy fares in `setup.evaluations` full episodes on the target.
 
     Returns these fields of `RoundInfo`: mean return, mean cost of a step, and the share that was at its goal in the
-    end. NaN where there is no task, no episode, or no goal.
+    end, over the episodes that did not diverge. NaN where there is no task, no such episode, or no goal.
     """
     nothing = jnp.array(jnp.nan)
     if setup.task is None or setup.evaluations == 0:
@@ -289,11 +300,16 @@ def evaluate(key: PRNGKeyArray, setup: Setup, target: Target, state: State) -> d
     policy, task = setup.learner.policy(state.learner, deterministic=True), setup.task
     keys = jax.random.split(jax.random.fold_in(key, state.round), setup.evaluations)
     seen = jax.vmap(lambda k: target.record(k, policy, task.steps))(keys)
+    sound = ~seen.diverged
+
+    def mean(values: Array) -> Scalar:
+        return jnp.mean(values, where=sound)
+
     returns = seen.rewards.sum(-1)
     return {
-        "return_target": returns.mean(),
-        "cost_target": -(returns / jnp.maximum(seen.valid.sum(-1), 1)).mean(),
-        "success_target": jnp.mean(seen.rewards[:, -1] >= 0.0) if isinstance(task, GoalTask) else nothing,
+        "return_target": mean(returns),
+        "cost_target": -mean(returns / jnp.maximum(seen.valid.sum(-1), 1)),
+        "success_target": mean(seen.rewards[:, -1] >= 0.0) if isinstance(task, GoalTask) else nothing,
     }
 
 
@@ -303,12 +319,11 @@ def infers(setup: Setup, round: Any) -> Any:
 
 
 def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording) -> tuple[State, RoundInfo]:
-    """One round on recordings made with the current policy (leading axis `set`, `setup.recordings` long)."""
-    if recordings.valid.shape != (setup.recordings, setup.steps):
-        raise ValueError(
-            f"update: recordings have shape {recordings.valid.shape} (set, steps); this setup was made for "
-            f"({setup.recordings}, {setup.steps}): pad the recordings or change `recordings` and `steps`."
-        )
+    """One round on recordings made with the current policy (leading axis `set`, `setup.recordings` long).
+
+    Raises `ValueError` where their shapes are not those that the setup was made for.
+    """
+    _check_shapes(setup, state, recordings)
     # barriers: what the compiler makes of a round does not depend on what stands around it, so that a round in a scan
     # and one called by itself are the same to the last bit
     state, recordings = jax.lax.optimization_barrier((state, recordings))
@@ -373,7 +388,7 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
         return_target=jnp.array(jnp.nan),
         cost_target=jnp.array(jnp.nan),
         success_target=jnp.array(jnp.nan),
-        diverged=simulated.diverged.sum(),
+        diverged=simulated.diverged.sum() + (sets.diverged & use).sum(),
         pool_size=weights.sum() ** 2 / (weights**2).sum(),
         uninformed=uninformed,
         collapsed=calibration.collapsed & ~stays,
@@ -381,6 +396,20 @@ def update(key: PRNGKeyArray, setup: Setup, state: State, recordings: Recording)
     )
     after = State(state.round + 1, belief, estimator, learner, pool, kept, history, policies)
     return jax.lax.optimization_barrier((after, info))
+
+
+def _check_shapes(setup: Setup, state: State, recordings: Recording) -> None:
+    if recordings.valid.shape != (setup.recordings, setup.steps):
+        raise ValueError(
+            f"update: recordings have shape {recordings.valid.shape} (set, steps); this setup was made for "
+            f"({setup.recordings}, {setup.steps}): pad the recordings or change `recordings` and `steps`."
+        )
+    for (path, given), known in zip(jax.tree.leaves_with_path(recordings), jax.tree.leaves(state.history), strict=True):
+        if given.shape[1:] != known.shape[1:]:
+            raise ValueError(
+                f"update: {jax.tree_util.keystr(path, simple=True)} of the recordings have shape {given.shape}; this "
+                f"setup's system asks for {(setup.recordings, *known.shape[1:])}."
+            )
 
 
 def improve(key: PRNGKeyArray, setup: Setup, state: State) -> tuple[State, RoundInfo]:

@@ -30,16 +30,17 @@ def trials(
     draws: int = 512,
     target: Callable[[Any], Any] | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """Yield, for each run, arrays over rounds: log q(θ*), the credible level and the ranks of θ*, mean log marginals.
+    """Yield, for each run, arrays over rounds: log q(θ*), the credible level and the ranks of θ*, pairs of its axes.
 
     The target is the setup's own system, or what `target(θ*)` makes. With `out` every run is appended to that file of
     JSON lines, and runs that it holds already under the same `labels`, seed and rounds are taken from there.
 
     `level` is the smallest highest-density credible level that holds θ*: uniform if calibrated. `rank` is the share of
-    posterior draws below θ*, per axis. `log_marginals` are normal scores of pairs of axes (0, 1), (2, 3), ….
+    posterior draws below θ*, per axis. `log_q_pairs` and `level_pairs` are log q(θ*) and its credible level in the
+    marginals of axes (0, 1), (2, 3), …, where there are more than two.
     """
     box = setup.system.parameters
-    pairs = [tuple(range(i, min(i + 2, box.size))) for i in range(0, box.size, 2)]
+    pairs = [tuple(range(i, min(i + 2, box.size))) for i in range(0, box.size, 2)] if box.size > 2 else []
 
     def one(key: Any) -> dict[str, Any]:
         truth_key, run_key, judge_key = jax.random.split(key, 3)
@@ -47,18 +48,17 @@ def trials(
         hidden = SimulatedTarget(setup.system, setup.task, truth) if target is None else target(truth)
         _, infos = online.run(run_key, setup, hidden, rounds=rounds)
 
-        def judge(key: Any, belief: Any) -> dict[str, Any]:
+        def judge(of: tuple[Any, Any]) -> dict[str, Any]:
+            key, belief = of
             summary = summarize(key, belief, truth, draws)
-            return {
-                "log_q": summary.log_prob_true,
-                "level": summary.level_true,
-                "rank": summary.rank_true,
-                "log_marginals": jnp.stack(
-                    [belief.mixture.marginal(pair).log_prob(truth[jnp.array(pair)]) for pair in pairs]
-                ),
-            }
+            told = {"log_q": summary.log_prob_true, "level": summary.level_true, "rank": summary.rank_true}
+            if not pairs:
+                return told
+            every = jnp.concatenate([truth[None], summary.draws])
+            logs = jnp.stack([belief.marginal_log_prob(pair, every[:, jnp.array(pair)]) for pair in pairs])
+            return told | {"log_q_pairs": logs[:, 0], "level_pairs": (logs[:, 1:] > logs[:, :1]).mean(1)}
 
-        judged = jax.vmap(judge)(jax.random.split(judge_key, rounds), infos.belief)
+        judged = jax.lax.map(judge, (jax.random.split(judge_key, rounds), infos.belief))
         return judged | {
             "truth": truth,
             "return_target": infos.return_target,

@@ -84,7 +84,7 @@ def test_experiments_with_planners_run_and_resume(script, words, tmp_path):
 @pytest.mark.parametrize(
     ("script", "words", "page"),
     [
-        ("reproduce_table1", ["--kept", "--rows", "cartpole", "pendulum", "acrobot"], "benchmarks"),
+        ("reproduce_table1", ["--kept", "--rows", "cartpole", "pendulum"], "benchmarks"),
         ("calibration", ["--kept", "--proposals", "corrected", "truncated", "paper"], "inference"),
         ("reproduce_table2", [], "control"),
         ("reproduce_table2", ["--use", "particles", "--particles", 4, "--samples", 128], "control"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import jax
@@ -13,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from bayessim_jax.beliefs.algebra import reduce
 from bayessim_jax.beliefs.box_probability import box_probability, condition, lattice
 from bayessim_jax.beliefs.mixture import GaussianMixture
-from bayessim_jax.beliefs.triangular import factor, log_normal, solve_positive
+from bayessim_jax.beliefs.triangular import factor, log_normal, solve_lower, solve_positive
 from bayessim_jax.chance import pick
 from bayessim_jax.contracts import Box, Scalar
 
@@ -178,27 +179,29 @@ class Truncated:
         cut = GaussianMixture(self.log_shares, means, trils)
         return jax.tree.map(lambda a, b: jnp.where(self.prior_share >= 1.0, a, b), flat, cut)
 
-    def marginal_log_prob(self, axis: int, grid: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Log density of one axis of θ at the points of a grid, in raw units; −∞ outside the box.
+    def marginal_log_prob(self, axes: Sequence[int], points: Float[Array, "n axes"]) -> Float[Array, " n"]:
+        """Log density of some axes of θ at n points, in raw units; −∞ outside the box.
 
-        p(θ_i = g) ∝ Σₖ αₖ N(g; μₖᵢ, Σₖᵢᵢ) P(the other axes lie in the box | θ_i = g).
+        p(θ_A = g) ∝ Σₖ αₖ N(g; μₖ_A, Σₖ_AA) P(the other axes lie in the box | θ_A = g).
         """
-        order = jnp.array([axis, *(j for j in range(self.box.size) if j != axis)])
+        first = len(axes)
+        order = jnp.array([*axes, *(j for j in range(self.box.size) if j not in axes)])
         low, high = self.box.low[order], self.box.high[order]
         means = self.mixture.means[:, order]
         trils = jax.vmap(factor)(self.mixture.scale_trils[:, order])
 
-        def unnormalized(g: Scalar) -> Scalar:
-            centred = g - means[:, :1]
-            logs = jax.nn.log_softmax(self.mixture.log_weights) + jax.vmap(log_normal)(centred, trils[:, :1, :1])
-            if self.box.size > 1:
-                rest = means[:, 1:] + trils[:, 1:, 0] * centred / trils[:, :1, 0]
-                logs = logs + box_probability(rest, trils[:, 1:, 1:], low[1:], high[1:])
+        def unnormalized(g: Float[Array, " axes"]) -> Scalar:
+            centred, own = g - means[:, :first], trils[:, :first, :first]
+            logs = jax.nn.log_softmax(self.mixture.log_weights) + jax.vmap(log_normal)(centred, own)
+            if self.box.size > first:
+                moved = jnp.einsum("kij,kj->ki", trils[:, first:, :first], jax.vmap(solve_lower)(own, centred))
+                rest = means[:, first:] + moved
+                logs = logs + box_probability(rest, trils[:, first:, first:], low[first:], high[first:])
             return jax.nn.logsumexp(logs)
 
-        cut = jax.vmap(unnormalized)(grid) - self.log_mass()
-        inside = (grid >= low[0]) & (grid <= high[0])
-        return jnp.where(inside, self._blend(-jnp.log(high[0] - low[0]), cut), -jnp.inf)
+        cut = jax.vmap(unnormalized)(points) - self.log_mass()
+        inside = ((points >= low[:first]) & (points <= high[:first])).all(-1)
+        return jnp.where(inside, self._blend(-jnp.log((high - low)[:first]).sum(), cut), -jnp.inf)
 
     def _blend(self, flat: Scalar, cut: Float[Array, "..."]) -> Float[Array, "..."]:
         return jnp.logaddexp(_log(self.prior_share) + flat, _log(1 - self.prior_share) + cut)

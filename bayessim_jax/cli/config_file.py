@@ -41,7 +41,8 @@ def settings_from(tables: Mapping[str, Any], where: str) -> dict[str, Any]:
         checked[key] = _check(value, hints[key], f"{where}: {key}")
     for name, bounds in checked.get("prior", {}).items():
         if not bounds[0] < bounds[1]:
-            raise UsageError(f"{where}: prior.{name}: low {bounds[0]} must be below high {bounds[1]}; swap them.")
+            low, high = bounds
+            raise UsageError(f"{where}: prior.{name}: low {low} must be below high {high}; swap or widen the bounds.")
     return checked
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -43,10 +44,17 @@ def evaluate(words: Sequence[str]) -> int:
     try:
         use_compilation_cache()
         folder = RunFolder.open(command.run)
-        result = evaluate_run(folder, command.recordings)
+        tell = (lambda line: None) if command.quiet else (lambda line: print(line, file=sys.stderr))
+        result = evaluate_run(folder, command.recordings, tell)
         write_text(folder.path / "evaluation.json", to_json(result, indent=2) + "\n")
-    except (ValueError, KeyError) as error:
+    except KeyError as error:
+        raise UsageError(f"{command.run}: its files lack {error}; run bayessim diagnose again.") from error
+    except ValueError as error:
         raise UsageError(str(error)) from error
+    except Exception as error:  # whatever else goes wrong is told in one line, too
+        reason = next(iter(str(error).splitlines()), "")
+        print(f"bayessim: the evaluation failed: {type(error).__name__}: {reason[:300]}", file=sys.stderr)
+        return 1
     finally:
         jax.config.update("jax_enable_x64", double)
     if not command.quiet:

@@ -1,4 +1,4 @@
-"""Ctrl-C: finish the round in hand, write it, stop; a second one stops at once."""
+"""Ctrl-C: finish the round in hand, or the compilation, write it, stop; a second one stops at once."""
 
 from __future__ import annotations
 
@@ -40,4 +40,4 @@ class Interruption:
             print(f"\n{self.farewell}", file=sys.stderr, flush=True)
             os._exit(128 + number)
         self.code = 128 + number
-        self.tell("stopping after this round; press Ctrl-C again to stop at once")
+        self.tell("stopping when what is under way is done; press Ctrl-C again to stop at once")

@@ -21,7 +21,7 @@ def online(words: Sequence[str]) -> int:
     folder = RunFolder(command.folder)
     try:
         if not command.resume:
-            folder.check_free()
+            folder.check_free(resumable=True)
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA's remarks on slow compilation
         from bayessim_jax.cli.cache import use_compilation_cache
         from bayessim_jax.cli.memory import return_large_blocks

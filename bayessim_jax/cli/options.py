@@ -141,7 +141,8 @@ class Settings:
     are learned, or hand-made summaries with and without random Fourier features (the BayesSim RFF and epsilon-free
     baselines)."""
     proposal: Literal["corrected", "paper", "truncated"] = "corrected"
-    """Where to simulate in the next round: the paper's mode, with the proposal divided out, or the truncated prior."""
+    """Where to simulate in the next round: around the belief, which is divided out again (corrected); where the paper
+    does; or from the prior, on a box around the belief (truncated)."""
     simulations: int = 200
     """Parameters simulated in a round."""
     steps: int = 50

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import dataclasses
+import functools
+import inspect
 import io
 import re
-from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
+import textwrap
+from itertools import pairwise
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
 import tyro
+from typing_extensions import Doc
 
 from bayessim_jax.spelling import near_miss
 
@@ -27,6 +33,7 @@ class UsageError(Exception):
 
 def parse(schema: type[C], words: Sequence[str], prog: str, default: C | None = None) -> C:
     """Fill a dataclass from the command line; raises `UsageError`, and `SystemExit(0)` after printing help."""
+    _describe(schema)
     flags, hidden = _flags(schema)
     flags += ["--help"]
     for word in words:
@@ -46,6 +53,24 @@ def parse(schema: type[C], words: Sequence[str], prog: str, default: C | None = 
         if stop.code in (0, None):
             raise
     raise UsageError(_one_line(told.getvalue(), prog))
+
+
+@functools.cache
+def _describe(schema: Any) -> None:
+    """Hand the parser the fields' docstrings without the line breaks, which it keeps, and no default that is empty."""
+    hints = get_type_hints(schema, include_extras=True)
+    for kind in get_type_hints(schema).values():
+        if dataclasses.is_dataclass(kind):
+            _describe(kind)
+    (source,) = ast.parse(textwrap.dedent(inspect.getsource(schema))).body
+    assert isinstance(source, ast.ClassDef)
+    for statement, after in pairwise(source.body):
+        match statement, after:
+            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
+                field = schema.__dataclass_fields__[name]
+                empty = field.default in ("", None) or field.default_factory is dict
+                hint = tyro.conf.arg(help_behavior_hint="") if empty else tyro.conf.arg()
+                schema.__annotations__[name] = Annotated[hints[name], Doc(" ".join(text.split())), hint]
 
 
 def _flags(schema: Any) -> tuple[list[str], list[str]]:

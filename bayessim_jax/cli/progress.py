@@ -29,9 +29,10 @@ def describe(lines: Sequence[Mapping[str, Any]], left: float) -> str:
         parts.append(f"return {returned:7.1f}")
     if (success := mean("success_target")) is not None:
         parts.append(f"success {success:4.2f}")
-    parts.append(f"{lines[0]['simulations_per_second']:6.0f} simulations/s")
+    if (speed := lines[0]["simulations_per_second"]) > 0:
+        parts.append(f"{speed:6.0f} simulations/s")
     parts.append(f"{_duration(left)} left")
-    marks = ("overconfident", "over-confident"), ("overfit", "over-fitted"), ("collapsed", "collapsed")
+    marks = ("overconfident", "over-confident"), ("overfit", "over-fitted"), ("diverged_target", "target diverged")
     parts += [word for name, word in marks if any(line.get(name) for line in lines)]
     if any((line.get("strangeness") or 0.0) > STRANGE for line in lines):
         parts.append("strange")
@@ -49,14 +50,14 @@ def _duration(seconds: float) -> str:
 class Reporter:
     """Progress on standard error; plain lines where that is no terminal, nothing where quiet."""
 
-    def __init__(self, rounds: int, done: int = 0, quiet: bool = False) -> None:
+    def __init__(self, rounds: int, quiet: bool = False) -> None:
         self.console = Console(stderr=True, quiet=quiet, highlight=False, soft_wrap=True)
         self.rounds, self.times = rounds, []
         self.bar: Progress | None = None
         if self.console.is_terminal and not quiet:
             columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
             self.bar = Progress(*columns, console=self.console, transient=True)
-            self.task = self.bar.add_task("starting", total=rounds, completed=done)
+            self.task = self.bar.add_task("starting", total=rounds)
 
     def __enter__(self) -> Reporter:
         if self.bar is not None:
@@ -78,11 +79,11 @@ class Reporter:
         else:
             self.say(text)
 
-    def compiled(self, seconds: float) -> None:
-        """Tell how long the compilation took."""
+    def compiled(self, seconds: float, done: int) -> None:
+        """Tell how long the compilation took; so many rounds are done already."""
         self.say(f"compiled in {seconds:.1f} s")
         if self.bar is not None:
-            self.bar.update(self.task, description="running")
+            self.bar.update(self.task, description="running", completed=done)
 
     def round(self, index: int, lines: Sequence[Mapping[str, Any]], seconds: float) -> None:
         """Tell of a round that is on disk."""

@@ -53,6 +53,8 @@ class Session:
         """Run to the end, an interruption or a failure; returns the exit code."""
         facts: dict[str, Any] = {}
         try:
+            if not self.resume:  # before anything takes long: what is killed from here on can be taken up
+                self._open(facts, {})
             with (
                 Reporter(self.plan.settings.rounds, quiet=self.quiet) as reporter,
                 Interruption(reporter.say, f"interrupted; continue with: {self.continuation}") as interruption,
@@ -65,9 +67,8 @@ class Session:
             reason = f"{type(error).__name__}: {next(iter(str(error).splitlines()), '')}"
             if facts:
                 self._close(facts, "failed", error=traceback.format_exc())
-            print(
-                f"bayessim: the run failed: {reason[:300]} (more in {self.folder.path / 'run.json'})", file=sys.stderr
-            )
+            more = f" (more in {self.folder.path / 'run.json'})" if facts else ""
+            print(f"bayessim: the run failed: {reason[:300]}{more}", file=sys.stderr)
             return 1
 
     def _journal(self) -> Journal:
@@ -77,31 +78,29 @@ class Session:
             "inference_library": "bayessim_jax",
             "inference_library_version": __version__,
         }
-        simulations = plan.settings.simulations + plan.settings.calibrations * plan.settings.history
+        simulations = plan.settings.simulations + plan.settings.calibrations * plan.setup.remembered
         system, settings = plan.setup.system, plan.settings.tables()
         return Journal(self.folder, system, plan.seeds, plan.truths, settings, attributes, simulations)
 
     def _rounds(self, facts: dict[str, Any], reporter: Reporter, interruption: Interruption, journal: Journal) -> int:
         rounds, started = self.plan.settings.rounds, time.perf_counter()
-        if self.resume:
+        begun = journal.checkpoints.latest is not None or (self.folder.path / "metrics.jsonl").exists()
+        if self.resume and begun:
             self._refuse_another(journal)
         for remark in self.plan.remarks:
             reporter.say(remark)
         reporter.stage("compiling; this is quick the next time")
         state, done = self.plan.start(), 0
-        if self.resume:
+        if self.resume and begun:
             done, state = self._take_up(journal, state)
-            facts.update(self._opening(self.folder.read_run()))
-        else:
-            facts.update(self._opening({}))
-        self.folder.write_config(self.plan.settings.tables())
-        self.folder.write_run(facts)
-        if not self.resume:
+        if self.resume:
+            self._open(facts, self.folder.read_run())
+        if not begun:
             journal.begin(state)
         if done < rounds:
             advance = self.plan.compile(state)
             facts["compile_seconds"] = round(time.perf_counter() - started, 2)
-            reporter.compiled(facts["compile_seconds"])
+            reporter.compiled(facts["compile_seconds"], done)
             done = run_rounds(advance, state, journal, done, rounds, reporter, interruption)
         else:
             reporter.say(f"all {rounds} rounds are done already; go on with --rounds {2 * rounds}")
@@ -132,6 +131,12 @@ class Session:
             return journal.resume(state)
         except ValueError as error:
             raise UsageError(str(error)) from error
+
+    def _open(self, facts: dict[str, Any], before: dict[str, Any]) -> None:
+        """Put on disk what is run, before it is run; `before` are the facts of the sittings before this one."""
+        facts.update(self._opening(before))
+        self.folder.write_config(self.plan.settings.tables())
+        self.folder.write_run(facts)
 
     def _opening(self, before: dict[str, Any]) -> dict[str, Any]:
         device, plan, now = jax.devices()[0], self.plan, _now()

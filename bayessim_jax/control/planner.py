@@ -48,7 +48,9 @@ class PlannerInfo:
     """Nothing is simulated to improve a planner, so there is no return; it has no gradients to be wrong."""
 
     return_mean: Scalar
+    """NaN."""
     nonfinite: Int[Array, ""]
+    skipped: Int[Array, ""]
 
 
 @struct.dataclass
@@ -72,7 +74,7 @@ class Planner:
 
     def step(self, key: PRNGKeyArray, state: Particles, belief: Belief) -> tuple[Particles, PlannerInfo]:
         """Replace the belief."""
-        return self.disco.digest(key, belief), PlannerInfo(jnp.array(jnp.nan), jnp.array(0))
+        return self.disco.digest(key, belief), PlannerInfo(jnp.array(jnp.nan), jnp.array(0), jnp.array(0))
 
     def policy(self, state: Particles, deterministic: bool = False) -> PlannerPolicy:
         """The planner with the belief of this state; `deterministic` leaves the jitter out."""

@@ -174,12 +174,12 @@ class MixtureDensity:
             info = judge(before, before, weights, z.shape[1], jnp.ones(()))
             return state, info, state.correction.apply(seen).affine(state.shift, state.scale)
         if isinstance(state.correction, Readout):
-            correction, after = read_sets(key, plain, z, low, high)
+            correction, after, skipped = read_sets(key, plain, z, low, high)
         else:
-            correction, after = recalibrate(key, plain, z, weights, low, high)
+            (correction, after), skipped = recalibrate(key, plain, z, weights, low, high), jnp.array(0)
         corrected = correction.apply(seen)
         widen = _width(corrected) / _width(seen)
-        info = judge(levels(after.size), after, by_number(weights[: after.size]), z.shape[1], widen)
+        info = judge(levels(after.size), after, by_number(weights[: after.size]), z.shape[1], widen, skipped)
         return replace(state, correction=correction), info, corrected.affine(state.shift, state.scale)
 
     def posterior(self, state: EstimatorState, recordings: Recording, use: Bool[Array, " set"]) -> GaussianMixture:

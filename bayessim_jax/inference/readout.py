@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from bayessim_jax.beliefs import GaussianMixture
 from bayessim_jax.beliefs.triangular import solve_lower
@@ -77,7 +77,7 @@ def read_sets(
     truths: Float[Array, "n d"],
     low: Float[Array, " d"],
     high: Float[Array, " d"],
-) -> tuple[Readout, Float[Array, " held"]]:
+) -> tuple[Readout, Float[Array, " held"], Int[Array, ""]]:
     """Learn θ of n sets from their combined evidence, a Gaussian each, and make the credible sets hold their share.
 
     The product of the evidence of many recordings is a summary of the set, not its posterior: an error that networks
@@ -89,7 +89,8 @@ def read_sets(
     hold their share of the truths: those of the average of the networks, which is wider than each where they differ,
     for sets that one of them and the regression have not seen.
 
-    Returns the readout, and the credible levels of the truths of these sets, the first ones.
+    Returns the readout, the credible levels of the truths of these sets, the first ones, and how many updates were
+    skipped because loss or gradient was not finite.
 
     Source: Blum and François 2010; Papamakarios and Murray 2016
     """
@@ -123,23 +124,23 @@ def read_sets(
         key, unseen, nothing = args
         start = HEAD.init(key, x.shape[1], d)
         start |= {"out": 0.1 * start["out"]}
-        params, _ = fit(key, start, HEAD.log_prob, x, left, jnp.ones(n), unseen, schedule)
+        params, info = fit(key, start, HEAD.log_prob, x, left, jnp.ones(n), unseen, schedule)
         gain = HEAD.log_prob(params, x, left) - HEAD.log_prob(nothing, x, left)
         count = unseen.sum()
         mean = jnp.where(unseen, gain, 0.0).sum() / count
         variance = jnp.where(unseen, (gain - mean) ** 2, 0.0).sum() / count
         better = mean > jnp.sqrt(variance / count)
-        return jax.tree.map(lambda a, b: jnp.where(better, a, b), params, nothing)
+        return jax.tree.map(lambda a, b: jnp.where(better, a, b), params, nothing), info.nonfinite
 
     unseen = part == jnp.arange(MEMBERS)[:, None]
-    params = jax.lax.map(member, (jax.random.split(fit_key, MEMBERS), unseen, readout.params))
+    params, skipped = jax.lax.map(member, (jax.random.split(fit_key, MEMBERS), unseen, readout.params))
     readout = replace(readout, params=params)
 
     held = -(-n * MEMBERS // FOLDS)
     sets, z = jax.tree.map(lambda leaf: leaf[:held], (evidence, truths))
     levels = credible_levels(level_key, jax.vmap(readout.apply)(sets), z, low, high, jnp.array(SCALES))
     best = best_scale(levels, jnp.ones(held))
-    return replace(readout, scale=jnp.array(SCALES)[best]), levels[:, best]
+    return replace(readout, scale=jnp.array(SCALES)[best]), levels[:, best], skipped.sum()
 
 
 def _moments(evidence: GaussianMixture) -> Float[Array, " features"]:

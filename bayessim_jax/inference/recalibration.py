@@ -52,6 +52,8 @@ class CalibrationInfo:
     collapsed: Bool[Array, ""]
     """The networks' 90 % sets hold fewer truths than those of a Gaussian with half the standard deviations it should
     have, by more than chance (three standard errors): most of the evidence that they see is not there."""
+    nonfinite: Int[Array, ""]
+    """Updates of the networks that read sets which were skipped because loss or gradient was not finite."""
 
 
 @struct.dataclass
@@ -225,7 +227,12 @@ def credible_levels(
 
 
 def judge(
-    before: Float[Array, " n"], after: Float[Array, " n"], weights: Float[Array, " n"], d: int, widen: Scalar
+    before: Float[Array, " n"],
+    after: Float[Array, " n"],
+    weights: Float[Array, " n"],
+    d: int,
+    widen: Scalar,
+    nonfinite: Int[Array, ""] | int = 0,
 ) -> CalibrationInfo:
     """What the credible levels of n truths say, before and after recalibration; Σ w = (Σ w)² / Σ w²."""
     share, count = weights / weights.sum(), weights.sum()
@@ -238,4 +245,5 @@ def judge(
         widen=widen,
         overconfident=coverage90 < 0.9 - 5.0 * jnp.sqrt(0.09 / count),
         collapsed=network < halved - 3.0 * jnp.sqrt(halved * (1.0 - halved) / count),
+        nonfinite=jnp.asarray(nonfinite),
     )

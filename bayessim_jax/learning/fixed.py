@@ -57,7 +57,9 @@ class FixedInfo:
     """Nothing was learned, and nothing went wrong."""
 
     return_mean: Scalar
+    """NaN."""
     nonfinite: Int[Array, ""]
+    skipped: Int[Array, ""]
 
 
 @struct.dataclass
@@ -72,7 +74,7 @@ class Fixed:
 
     def step(self, key: PRNGKeyArray, state: tuple[()], belief: Belief) -> tuple[tuple[()], FixedInfo]:
         """Do nothing."""
-        return (), FixedInfo(jnp.array(jnp.nan), jnp.array(0))
+        return (), FixedInfo(jnp.array(jnp.nan), jnp.array(0), jnp.array(0))
 
     def policy(self, state: tuple[()], deterministic: bool = False) -> Any:
         """The policy given."""

@@ -40,6 +40,7 @@ class PpoInfo:
     return_mean: Scalar
     """Mean undiscounted return of the episodes that ended in this round."""
     length_mean: Scalar
+    """Their mean length, steps."""
     entropy: Scalar
     """Of the policy, nats."""
     value_loss: Scalar

@@ -46,6 +46,7 @@ class SacInfo:
     return_mean: Scalar
     """Mean undiscounted return of the episodes that ended in this round."""
     length_mean: Scalar
+    """Their mean length, steps."""
     entropy: Scalar
     """Of the policy's squashed actions in half-widths of their box, nats."""
     temperature: Scalar

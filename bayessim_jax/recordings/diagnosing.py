@@ -106,11 +106,15 @@ class CaseDiagnosis:
         """Recordings that neither a fit nor the choice has seen."""
         return sorted({self.model.recordings[i].name for i in self.windows.recording[~self.chosen]})
 
+    @property
+    def augmented(self) -> str:
+        """Whose scores are the augmented simulator's: where nothing is named, those of the simulator as it is."""
+        return "augmented" if self.result.names_something else "baseline"
+
     def table(self) -> dict[str, Any]:
         """What `diagnosis.json` holds."""
         result, best = self.result, self.result.best
         named = result.names_something
-        augmented = "augmented" if named else "baseline"
         return {
             "schema": 1,
             "case": self.model.case.case.name,
@@ -132,7 +136,7 @@ class CaseDiagnosis:
                 "horizon": self.model.case.case.horizon,
                 "held_out": self.held_out,
                 "baseline": self.scores["baseline"].as_table(),
-                "augmented": self.scores[augmented].as_table(),
+                "augmented": self.scores[self.augmented].as_table(),
                 **(
                     {"flexible": {k: v for k, v in self.scores["flexible"].as_table().items() if k != "per_channel"}}
                     if "flexible" in self.scores
@@ -422,7 +426,8 @@ def diagnose_case(
             result.take_back()
     if result.verdict == "unexplained":
         result.sooner = _test_sooner(key, explained, thresholds)
-    named = result.verdict != "no_mismatch"
+    located = result.verdict != "no_mismatch"
+    answers = result.confusion if result.names_something else [result.baseline]
     return CaseDiagnosis(
         model=model,
         bench=bench,
@@ -433,7 +438,7 @@ def diagnose_case(
         result=result,
         flexible=residual.found if residual else None,
         flexible_bench=residual.bench if residual else None,
-        locations=_locations(taken, result, residual) if named else [],
+        locations=_locations(taken, result, residual) if located else [],
         forces=residual.forces if residual else {},
         scores=scores,
         spreads=spreads,
@@ -442,7 +447,7 @@ def diagnose_case(
         noise_floor=floor,
         theta={
             "baseline": moments_of_theta(bench, [result.baseline], [1.0]),
-            "augmented": moments_of_theta(bench, result.confusion or [result.best], result.probabilities or [1.0]),
+            "augmented": moments_of_theta(bench, answers, result.probabilities or [1.0]),
         },
         experiment=next_experiment(model, bench, result, shots),
         absorbed=_absorbed(taken.problem, none),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from glob import glob
 from pathlib import Path
 from typing import Any
@@ -21,11 +21,11 @@ from bayessim_jax.recordings.assemble import read_recording
 from bayessim_jax.recordings.diagnosing import CaseDiagnosis
 from bayessim_jax.recordings.files import to_json, write_text
 from bayessim_jax.recordings.late import without_velocities
-from bayessim_jax.recordings.loading import LoadedCase, load_case
+from bayessim_jax.recordings.loading import LoadedCase, judge_holes, load_case
 from bayessim_jax.recordings.readers import SUFFIXES
 from bayessim_jax.recordings.run_folder import RunFolder
 from bayessim_jax.recordings.shots import CaseModel, case_model
-from bayessim_jax.recordings.wording import CaseError
+from bayessim_jax.recordings.wording import CaseError, merge
 
 __all__ = ["STATE", "evaluate_run", "read_table", "simulator_of", "write_state"]
 
@@ -34,13 +34,14 @@ STATE = "simulators.json"
 
 def write_state(folder: RunFolder, diagnosis: CaseDiagnosis) -> None:
     """Write `simulators.json`: parameters, effects and spreads of errors of every simulator of a diagnosis."""
-    bench, entries = diagnosis.bench, {}
+    bench, result, entries = diagnosis.bench, diagnosis.result, {}
+    answer = {"baseline": result.baseline, "augmented": result.best if result.names_something else result.baseline}
     for name in diagnosis.scores:
         if name == "flexible":
             assert diagnosis.flexible is not None and diagnosis.flexible_bench is not None
             own, candidate, last = diagnosis.flexible_bench, diagnosis.flexible.candidate, diagnosis.flexible.p
         else:
-            entry = diagnosis.result.baseline if name == "baseline" else diagnosis.result.best
+            entry = answer[name]
             own, candidate, last = bench, entry.candidate, entry.fit.z
         x: Any = np.asarray(last)
         entries[name] = {
@@ -48,10 +49,9 @@ def write_state(folder: RunFolder, diagnosis: CaseDiagnosis) -> None:
             "rounded": [getattr(own.pairs[k][0], "rounded", False) for k in candidate.effects],
             "theta": own.margins.theta(x[: own.d]).tolist(),
             "values": list(own.values(candidate, x).values()),
-            "spread": diagnosis.spreads[name].tolist(),
+            "spread": diagnosis.spreads[diagnosis.augmented if name == "augmented" else name].tolist(),
         }
-    noise = {"baseline": diagnosis.result.baseline, "augmented": diagnosis.result.best}
-    for name, entry in noise.items():
+    for name, entry in answer.items():
         entries[name]["noise"] = entry.misfit.noise.tolist()
     state = {
         "schema": 1,
@@ -87,14 +87,18 @@ def simulator_of(model: CaseModel, state: dict[str, Any], name: str) -> tuple[An
     return system, jnp.asarray(theta, float)
 
 
-def evaluate_run(run: RunFolder, pattern: str) -> dict[str, Any]:
+def evaluate_run(run: RunFolder, pattern: str, tell: Callable[[str], None] = lambda line: None) -> dict[str, Any]:
     """Score a diagnosis' simulators on recordings given later: what `evaluation.json` holds.
+
+    What is odd about the recordings is told; where numbers are missing nothing is compared.
 
     Raises `ValueError` where a file cannot be read or no recording holds a window.
     """
     state = read_table(run.path / STATE)
     case = load_case(Path(run.read_config()["case"]), mask=True).check()
     case = with_recordings(case, pattern)
+    for finding in case.findings:
+        tell(f"{finding.severity}: {finding}")
     model = case_model(case, refined=int(state["nearest"]), before=BEFORE)
     windows = model.windows(range(len(model.recordings)))
     shots = model.shots(windows)
@@ -127,13 +131,13 @@ BEFORE = 1.0
 
 
 def with_recordings(case: LoadedCase, pattern: str) -> LoadedCase:
-    """The same case with recordings from elsewhere; raises `CaseError` for one that cannot be used."""
+    """The same case with recordings from elsewhere, and findings of these; `CaseError` for one that cannot be used."""
     names = glob(pattern, recursive=True)  # noqa: PTH207 - the pattern may be absolute
     files = sorted(Path(name) for name in names if Path(name).is_file())
     if not files:
         ends = ", ".join(SUFFIXES)
         raise CaseError("--recordings", f"no file matches {pattern!r}", f"correct the pattern; files end in {ends}")
-    recordings = []
+    recordings, findings = [], []
     for path in files:
         recording, found = read_recording(path, case.layout, case.case.channels)
         errors = [f for f in found if f.severity == "error"]
@@ -141,7 +145,12 @@ def with_recordings(case: LoadedCase, pattern: str) -> LoadedCase:
             first = errors[0]
             raise CaseError(first.file, first.what, first.remedy, first.row)
         recordings.append(recording)
-    return dataclasses.replace(case, recordings=without_velocities(recordings, case.layout, case.lateness.channels))
+        findings += found
+    return dataclasses.replace(
+        case,
+        recordings=without_velocities(recordings, case.layout, case.lateness.channels),
+        findings=tuple(judge_holes(merge(findings), mask=True)),
+    )
 
 
 def read_table(path: Path) -> dict[str, Any]:

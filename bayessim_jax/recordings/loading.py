@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from bayessim_jax.recordings.recording import CaseRecording
 
-__all__ = ["LoadedCase", "load_case"]
+__all__ = ["LoadedCase", "judge_holes", "load_case"]
 
 
 @dataclass(frozen=True)
@@ -109,11 +109,11 @@ def load_case(folder: str | Path, *, mask: bool = False) -> LoadedCase:
         lateness, more = find_late(recordings, layout, model, case.horizon)
         recordings = without_velocities(recordings, layout, lateness.channels)
         found += more
-    findings = tuple(_judge_holes(merge(found), mask))
+    findings = tuple(judge_holes(merge(found), mask))
     return LoadedCase(case, layout, parameters, tuple(recordings), findings, model, spec, lateness)
 
 
-def _judge_holes(findings: list[Finding], mask: bool) -> list[Finding]:
+def judge_holes(findings: list[Finding], mask: bool) -> list[Finding]:
     """Holes as what they are to the one who asks: masked and told, or errors until they are."""
 
     def judge(hole: Finding) -> Finding:

@@ -36,7 +36,7 @@ class RunFolder:
 
     path: Path
 
-    def check_free(self) -> None:
+    def check_free(self, resumable: bool = False) -> None:
         """Raise `ValueError` where something is there already."""
         path = self.path
         try:
@@ -46,7 +46,8 @@ class RunFolder:
         except OSError as error:
             raise _unwritable(path, error) from error
         if used:
-            raise ValueError(f"output folder {path} is already used; continue with --resume or choose another --out.")
+            way = "continue with --resume or choose" if resumable else "choose"
+            raise ValueError(f"output folder {path} is already used; {way} another --out.")
 
     def create(self) -> RunFolder:
         """Make the folder, or raise `ValueError` where something is there already or cannot be written."""

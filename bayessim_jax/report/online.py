@@ -15,7 +15,7 @@ from bayessim_jax.report.evidence import OnlineRun
 from bayessim_jax.report.pairs import pair_plot
 from bayessim_jax.report.trust import coverage_plot, rank_plot, truth_coverage_plot
 from bayessim_jax.report.viewer import SCRIPT_HASH, script
-from bayessim_jax.report.words import headline, invocation, number, plus_minus, title, worries
+from bayessim_jax.report.words import collapses, headline, invocation, number, plus_minus, title, worries
 
 __all__ = ["render"]
 
@@ -178,6 +178,8 @@ def _calibration(run: OnlineRun) -> list[str]:
         "simulations trained on and held out; a widening gap is over-fitting. Orange crosses mark rounds that raised a "
         "flag."
     )
+    if run.settings.get("proposal") != "paper" and (told := collapses(run)):
+        caption += f" {told} The correction takes that out, at the price of a wider posterior."
     parts = [html.figure(svg, "Coverage on held-out simulations and fit scores against rounds.", caption, wide=True)]
     if run.truths is not None and len(run.seeds) > 1:
         caption = "How many seeds' credible sets hold their truth; the bands are what chance allows (95 %)."
@@ -205,6 +207,12 @@ def _next(run: OnlineRun, alarmed: bool) -> list[tuple[str, str]]:
     begin, out = invocation(run.settings), str(run.facts.get("folder", "RUN"))
     rounds, done = int(run.settings.get("rounds", run.rounds)), run.rounds
     resume = f"{begin} --out {shlex.quote(out)} --resume"
+
+    def anew(flag: str, value: int) -> str:
+        """The same run with another number, in a folder of its own."""
+        folder = shlex.quote(f"{out}-{flag}{value}")
+        return f"bayessim online --config {shlex.quote(f'{out}/config.toml')} --{flag} {value} --out {folder}"
+
     steps = []
     if done < rounds:
         steps.append(("Finish this run:", resume))
@@ -212,9 +220,9 @@ def _next(run: OnlineRun, alarmed: bool) -> list[tuple[str, str]]:
         steps.append(("Go on for as many rounds again:", f"{resume} --rounds {2 * rounds}"))
     if alarmed:
         more = 2 * int(run.settings.get("simulations", 200))
-        steps.append(("Give the estimator more simulations a round:", f"{begin} --simulations {more}"))
+        steps.append(("Give the estimator more simulations a round:", anew("simulations", more)))
     if len(run.seeds) == 1 and run.truths is not None:
-        steps.append(("See the spread over seeds, each with its own truth:", f"{begin} --seeds 8"))
+        steps.append(("See the spread over seeds, each with its own truth:", anew("seeds", 8)))
     read = f"xarray.open_datatree({out + '/posterior.nc'!r})['posterior']"
     steps.append(("Use the posterior in Python:", f"import xarray\n{read}"))
     steps.append(("Look at every number as it changed:", f"tensorboard --logdir {shlex.quote(out + '/tensorboard')}"))

@@ -15,7 +15,7 @@ from bayessim_jax.report.evidence import OnlineRun
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["headline", "invocation", "number", "plus_minus", "title", "worries"]
+__all__ = ["collapses", "headline", "invocation", "number", "plus_minus", "title", "worries"]
 
 
 def number(value: float | np.floating, digits: int = 3) -> str:
@@ -119,14 +119,8 @@ def worries(run: OnlineRun) -> list[str]:
             "Something is missing in the simulator, or the belief has lost the truth; what the simulator lacks is read "
             "as parameters, so do not trust the posterior."
         )
-    collapsed = int(np.nansum(run.series("collapsed")))
-    if collapsed:
-        share = float(np.nanmin(run.series("coverage90_network")))
-        found.append(
-            f"The networks' posterior collapsed in {_count(collapsed, 'round')}: down to {share:.0%} of the simulated "
-            "sets lay inside its 90 % credible set, fewer than if it stated half of its errors. Recalibration "
-            "widens it, except under the paper's proposals; more simulations a round make it better."
-        )
+    if run.settings.get("proposal") == "paper" and (told := collapses(run)):
+        found.append(f"{told} Nothing widens it under the paper's proposals; more simulations a round make it better.")
     if (n := int(np.nansum(at("overconfident")))) > 0:
         share = float(np.nanmin(at("coverage90")))  # of the last round that inferred, as everything here
         found.append(
@@ -138,11 +132,28 @@ def worries(run: OnlineRun) -> list[str]:
             f"The last fit over-fitted after its best epoch{_in(n, several)}; the weights of that epoch were kept."
         )
     found += _against_truth(run, several) if inferred.size else []
-    if (n := int(np.nansum(run.series("diverged")))) > 0:
-        found.append(f"{_count(n, 'simulation')} gave numbers that are not finite and took part in nothing.")
-    if (n := int(np.nansum(run.series("nonfinite")))) > 0:
-        found.append(f"{_count(n, 'update')} of the networks had a loss that is not finite and were skipped.")
+    counted = {
+        "diverged_target": ("recording", "of the target held numbers that are not finite and took part in nothing."),
+        "diverged": ("simulation", "gave numbers that are not finite and took part in nothing."),
+        "masked": ("step", "of the learner's simulations gave numbers that are not finite and were left out."),
+        "nonfinite": ("update", "of the networks had a loss that is not finite and were skipped."),
+    }
+    for name, (noun, what) in counted.items():
+        if (n := int(np.nansum(run.series(name)))) > 0:
+            found.append(f"{_count(n, noun)} {what}")
     return found
+
+
+def collapses(run: OnlineRun) -> str:
+    """In how many rounds the posterior of the networks alone collapsed; empty where it did not."""
+    collapsed = int((np.nan_to_num(run.series("collapsed")) > 0).any(0).sum())
+    if not collapsed:
+        return ""
+    share = float(np.nanmin(run.series("coverage90_network")))
+    return (
+        f"The posterior of the networks alone collapsed in {_count(collapsed, 'round')}: down to {share:.0%} of the "
+        "simulated sets lay inside its 90 % credible set, fewer than if it stated half of its errors."
+    )
 
 
 def _against_truth(run: OnlineRun, several: bool) -> list[str]:

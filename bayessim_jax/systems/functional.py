@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -59,11 +60,19 @@ def from_functions(
     Shapes and numbers are checked at the centre of the parameters' box, so that a slip is told here in one line and
     not from inside a compiled loop. Raises `ValueError`.
     """
+    if not dt > 0:
+        raise ValueError(f"dt is {dt}; it is the control period in seconds, above 0.")
+    sd = np.asarray(noise, float)
+    if sd.shape not in ((), (observations.size,)) or not (sd >= 0).all():
+        raise ValueError(
+            f"noise is {sd.tolist()}; it is a standard deviation, 0 or more, for all {observations.size} "
+            "observations or for each."
+        )
     system = FunctionalSystem(
         parameters=parameters,
         observations=observations,
         actions=actions,
-        noise=jnp.broadcast_to(jnp.asarray(noise, float), (observations.size,)),
+        noise=jnp.broadcast_to(jnp.asarray(sd, float), (observations.size,)),
         dt=dt,
         reset_fn=reset,
         step_fn=step,
@@ -73,9 +82,9 @@ def from_functions(
     state = system.reset(jax.random.key(0), theta)
     action = jnp.zeros(1) if isinstance(actions, Discrete) else (actions.low + actions.high) / 2
     after = system.step(theta, state, action)
-    before_types, after_types = (jax.tree.map(lambda x: jnp.asarray(x).shape, s) for s in (state, after))
-    if jax.tree.structure(state) != jax.tree.structure(after) or before_types != after_types:
-        raise ValueError(f"step returned a state of shape {after_types}; reset made {before_types}. Return the same.")
+    before, now = (jax.tree.map(_kind, s) for s in (state, after))
+    if jax.tree.structure(state) != jax.tree.structure(after) or before != now:
+        raise ValueError(f"step returned a state of {now}; reset made {before}. Return the same.")
     seen = jnp.asarray(system.observe(theta, after))
     if seen.shape != (observations.size,):
         raise ValueError(
@@ -88,3 +97,9 @@ def from_functions(
             "check its equations or narrow the parameters' box."
         )
     return system
+
+
+def _kind(leaf: Any) -> str:
+    """Type and shape, as `float32[2]`."""
+    array = jnp.asarray(leaf)
+    return f"{array.dtype}{list(array.shape)}"

@@ -32,7 +32,8 @@ from bayessim_jax.systems.mjcf import Unknown, mjcf_system
 __all__ = ["PIPELINES", "Hop", "Hopper", "HopperState"]
 
 PIPELINES = ("converged", "generalized", "positional", "spring", "mujoco")
-"""Brax's dynamics with our contacts, Brax's own as they come, and MuJoCo's C engine: the target's, as a reference."""
+"""Brax's dynamics with our contacts, Brax's own three with geoms grown by half of MuJoCo's margins, and MuJoCo's C
+engine: the target's, as a reference."""
 SUBSTEPS = 4
 SCATTER = 5e-3
 """Episodes begin with every position and velocity moved by up to this, m and rad, and per s."""

@@ -37,7 +37,7 @@ FINE = 600
 many_log_probs = jax.jit(jax.vmap(lambda b, t: b.log_prob(t), (None, 0)))
 sample = jax.jit(jax.vmap(lambda b, k: b.sample(k), (None, 0)))
 moments = jax.jit(lambda b: (b.mean(), b.covariance()))
-many_marginals = jax.jit(lambda b, grid, axis: b.marginal_log_prob(axis, grid), static_argnames="axis")
+many_marginals = jax.jit(lambda b, grid, axis: b.marginal_log_prob((axis,), grid[:, None]), static_argnames="axis")
 create = jax.jit(Truncated.create)
 
 
@@ -117,6 +117,20 @@ def test_marginal_agrees_with_quadrature(belief, quadrature):
         expected = np.bincount(index.ravel(), weights) / cell
         got = np.exp(marginal(belief, jnp.asarray(grid, jnp.float32), axis=axis))
         np.testing.assert_allclose(got, expected, rtol=0.02, atol=2e-3 * expected.max())
+
+
+def test_marginal_of_two_axes_is_the_density_with_the_third_integrated_out():
+    box = Box.create(a=(0.0, 1.0, "m"), b=(-1.0, 1.0, "m"), c=(0.0, 2.0, "m"))
+    tril = jnp.array([[0.3, 0.0, 0.0], [-0.2, 0.4, 0.0], [0.3, 0.3, 0.5]])
+    means = jnp.array([[0.2, 0.1, 1.9], [0.7, -0.9, 0.4]])
+    cut = create(GaussianMixture(jnp.array([0.0, 0.7]), means, jnp.stack([tril, 0.5 * tril])), box, SHARE)
+    at = jax.random.uniform(jax.random.key(0), (20, 2))  # c first, then b
+    c, b = 2 * at[:, 0], 2 * at[:, 1] - 1
+    a = (jnp.arange(400) + 0.5) / 400
+    whole = jnp.stack([jnp.broadcast_to(x, (20, 400)) for x in (a, b[:, None], c[:, None])], -1)
+    expected = jnp.exp(many_log_probs(cut, whole.reshape(-1, 3))).reshape(20, 400).mean(1)
+    got = jnp.exp(cut.marginal_log_prob((2, 1), jnp.stack([c, b], -1)))
+    np.testing.assert_allclose(got, expected, rtol=0.01)
 
 
 def test_one_axis_is_scipys_truncated_normal():

@@ -143,6 +143,7 @@ def test_a_run_of_another_configuration_is_not_continued(capsys, tmp_path):
     told = refused(capsys, "cartpole", "--config", tmp_path / "c.toml", "--out", out, "--resume")
     assert "steps is 50 there and 7" in told
     # the same words as before, or none at all, differ in nothing: what is missing now is the checkpoint
+    (tmp_path / "run" / "metrics.jsonl").touch()
     assert "no checkpoint" in refused(capsys, "--out", out, "--resume")
     assert "no checkpoint" in refused(capsys, "cartpole", "--seed", 3, "--rounds", 9, "--out", out, "--resume")
 

@@ -1,8 +1,10 @@
 """A sitting of a run with a made-up loop: what is on disk however it ends, and how it is taken up again."""
 
+import html
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 from dataclasses import replace
@@ -15,6 +17,7 @@ import pytest
 
 from bayessim_jax.cli.options import Settings
 from bayessim_jax.cli.parsing import UsageError
+from bayessim_jax.cli.resolution import read_command
 from bayessim_jax.cli.session import Session
 from bayessim_jax.recordings.run_folder import RunFolder
 from bayessim_jax.recordings.truths import Truths
@@ -31,7 +34,7 @@ class MadeUp:
 
     def __init__(self, rounds=4, seeds=1, before=lambda index: None):
         self.settings = replace(SETTINGS, rounds=rounds, seeds=seeds)
-        self.setup = SimpleNamespace(system=CartPole.create())
+        self.setup = SimpleNamespace(system=CartPole.create(), remembered=32)
         self.seeds = list(range(3, 3 + seeds))
         self.truths = Truths.constant(np.tile(np.array([0.5, 0.4], np.float32), (seeds, 1)))
         self.hidden, self.hidden_names = self.truths, self.setup.system.parameters.names
@@ -179,6 +182,36 @@ def test_a_run_that_fails_says_so_in_one_line(tmp_path, capsys):
     assert len(metrics(path)) == 4
     assert facts(path)["status"] == "finished"
     assert "error" not in facts(path)
+
+
+def test_a_run_killed_before_its_first_checkpoint_starts_from_what_is_on_disk(whole, tmp_path, capsys):
+    class Killed(BaseException):
+        pass
+
+    class DiesCompiling(MadeUp):
+        def start(self):
+            raise Killed
+
+    path = tmp_path / "run"
+    with pytest.raises(Killed):
+        sit(path, DiesCompiling())
+    assert facts(path)["status"] == "running"
+    words = ["--out", str(path), "--resume"]
+    assert read_command(words).settings == MadeUp().settings
+    assert sit(path, MadeUp(), resume=True) == 0
+    assert "round 1/4" in capsys.readouterr().err
+    assert metrics(path) == metrics(whole)
+    assert len(facts(path)["resumed"]) == 1
+
+
+def test_what_to_do_next_is_a_command_that_starts_the_same_run_anew(whole):
+    """The settings of the run but for the one that is named, and a folder that is free."""
+    page = html.unescape((whole / "report.html").read_text())
+    commands = [line for line in re.findall(r"bayessim online [^<\n]*", page) if "--config" in line]
+    assert len(commands) == 1
+    command = read_command(shlex.split(commands[0])[2:])
+    assert command.settings == replace(MadeUp().settings, seeds=8)
+    RunFolder(command.folder).check_free()
 
 
 def test_several_seeds_have_a_line_each(tmp_path):

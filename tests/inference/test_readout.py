@@ -57,7 +57,7 @@ def test_flat_directions_of_a_box_come_out_flat():
     means = jnp.stack([jnp.zeros(2048), truths[:, 1] + 0.05 * jax.random.normal(keys[1], (2048,))], axis=-1)
     stated = gaussians(means, jnp.diag(jnp.array([0.577, 0.05])))
     (seen, z), (fresh, told) = halves(stated, truths)
-    found, _ = read(keys[2], seen, z, *BOX)
+    found, _, _ = read(keys[2], seen, z, *BOX)
     assert outer_fifth(keys[3], fresh, told, *BOX) > 0.26
     assert abs(outer_fifth(keys[3], apply(found, fresh), told, *BOX) - 0.2) < 0.04
 
@@ -71,7 +71,7 @@ def test_a_bent_ridge_is_followed():
     means = jnp.sqrt(product) * jnp.ones(2)
     stated = gaussians(means, jnp.array([[0.3, 0.0], [-0.28, 0.05]]))
     (seen, z), (fresh, told) = halves(stated, truths)
-    found, levels = read(keys[2], seen, z, jnp.full(2, 0.2), jnp.ones(2))
+    found, levels, _ = read(keys[2], seen, z, jnp.full(2, 0.2), jnp.ones(2))
     after = apply(found, fresh)
     gain = log_probs(after, told) - log_probs(fresh, told)
     assert gain.mean() > 0.5
@@ -85,7 +85,7 @@ def test_evidence_counted_too_often_is_taken_back():
     truths = jax.random.normal(keys[0], (2048, 2))
     means = 0.7 * truths + 0.2 * jnp.sin(3 * truths[:, ::-1]) + 0.1 * jax.random.normal(keys[1], (2048, 2))
     (seen, z), (fresh, told) = halves(gaussians(means, 0.03 * jnp.eye(2)), truths)
-    found, levels = read(keys[2], seen, z, -FAR, FAR)
+    found, levels, _ = read(keys[2], seen, z, -FAR, FAR)
     after = apply(found, fresh)
     again = levels_of(keys[3], after, told)
     for level in (levels, again):
@@ -98,7 +98,7 @@ def test_a_calibrated_gaussian_stays_what_it_is():
     means = jax.random.normal(keys[0], (2048, 2))
     truths = means + 0.3 * jax.random.normal(keys[1], (2048, 2))
     (seen, z), (fresh, told) = halves(gaussians(means, 0.3 * jnp.eye(2)), truths)
-    found, _ = read(keys[2], seen, z, -FAR, FAR)
+    found, _, _ = read(keys[2], seen, z, -FAR, FAR)
     loss = log_probs(fresh, told) - log_probs(apply(found, fresh), told)
     assert -0.02 < float(loss.mean()) < 0.03
 
@@ -111,7 +111,7 @@ def test_few_sets_make_neither_too_small_nor_too_large_sets(n, slack):
         means = jax.random.normal(keys[0], (2 * n, 2))
         truths = 1.1 * means + 0.3 * jax.random.normal(keys[1], (2 * n, 2))
         (seen, z), (fresh, told) = halves(gaussians(means, 0.15 * jnp.eye(2)), truths)
-        found, _ = read(keys[2], seen, z, -FAR, FAR)
+        found, _, _ = read(keys[2], seen, z, -FAR, FAR)
         return levels_of(keys[3], apply(found, fresh), told)
 
     levels = jax.lax.map(one, jax.random.split(jax.random.key(4), 24)).ravel()
@@ -128,7 +128,7 @@ def test_without_sets_it_says_the_gaussian_that_it_reads():
 @pytest.mark.parametrize("n", [1, pytest.param(2, marks=pytest.mark.slow), 8])
 def test_a_handful_of_sets_gives_finite_numbers(n):
     means = jax.random.normal(jax.random.key(5), (n, 3))
-    found, levels = read(
+    found, levels, _ = read(
         jax.random.key(6), gaussians(means, jnp.eye(3)), means + 0.5, -jnp.full(3, 9.0), jnp.full(3, 9.0)
     )
     said = apply(found, gaussians(jnp.zeros((1, 3)), jnp.eye(3)))

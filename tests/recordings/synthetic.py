@@ -26,12 +26,14 @@ class Calibration:
     coverage90_network: jax.Array
     widen: jax.Array
     overconfident: jax.Array
+    nonfinite: jax.Array
 
 
 @struct.dataclass
 class Learning:
     return_mean: jax.Array
     nonfinite: jax.Array
+    skipped: jax.Array
 
 
 @jax.jit
@@ -71,8 +73,9 @@ def one_info(system, index, truth, steps=5, recordings=2, **flags):
             coverage90_network=jnp.array(0.8),
             widen=jnp.array(1.1),
             overconfident=flag("overconfident"),
+            nonfinite=jnp.array(0),
         ),
-        learning=Learning(return_mean=jnp.array(10.0 * index), nonfinite=jnp.array(0)),
+        learning=Learning(return_mean=jnp.array(10.0 * index), nonfinite=jnp.array(0), skipped=jnp.array(0)),
         return_target=jnp.array(20.0 * index),
         cost_target=jnp.array(0.1 * index),
         success_target=jnp.array(0.1 * index),

@@ -93,7 +93,14 @@ def test_recordings_given_later_are_scored(friction, folder, capsys):
     assert found["held_out"] == [held]
     ratios = [fit["augmented"]["nrmse"] / fit["baseline"]["nrmse"] for fit in (found, table["fit"])]
     assert ratios[0] == pytest.approx(ratios[1], rel=0.3)  # each over how far its own recordings go
-    assert "augmented" in capsys.readouterr().out
+    told = capsys.readouterr()
+    assert "augmented" in told.out and told.err == ""
+    holed = folder / "holed.csv"
+    lines = (folder / "friction" / "recordings" / held).read_text().splitlines()
+    lines[20:25] = [re.sub(r"^([^,]*),[^,]*", r"\1,nan", line) for line in lines[20:25]]
+    holed.write_text("\n".join(lines) + "\n")
+    assert main(["evaluate", str(run), "--recordings", str(holed)]) == 0
+    assert capsys.readouterr().err.startswith("warning: holed.csv")
     assert main(["evaluate", str(run), "--recordings", str(folder / "nothing" / "*.csv")]) == 2
     assert main(["evaluate", str(folder), "--recordings", "x.csv"]) == 2
     told = capsys.readouterr().err.strip().splitlines()
@@ -155,6 +162,12 @@ def test_what_no_candidate_explains_is_refused_and_located(folder):
     table = json.loads((folder / "beat-run" / "diagnosis.json").read_text())
     assert table["verdict"] == "unexplained"
     assert table["effects"] == [] and table["locations"][0]["at"] == "joint/hinge"
+    # nothing is put in, so nothing is changed: neither here nor where the simulators are run again
+    assert all(found["augmented"] == found["baseline"] for found in table["parameters"].values())
+    later = folder / "beat" / "recordings" / table["fit"]["held_out"][0]
+    assert main(["evaluate", str(folder / "beat-run"), "--recordings", str(later), "--quiet"]) == 0
+    fit = json.loads((folder / "beat-run" / "evaluation.json").read_text())["fit"]
+    assert fit["augmented"] == fit["baseline"]
 
 
 @pytest.mark.slow

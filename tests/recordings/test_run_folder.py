@@ -41,8 +41,10 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_litter(tmp_path):
 
 def test_a_used_folder_is_refused_and_untouched(tmp_path):
     (tmp_path / "note.txt").write_text("mine")
-    with pytest.raises(ValueError, match=r"already used.*--resume.*--out"):
+    with pytest.raises(ValueError, match=r"already used; choose another --out"):
         RunFolder(tmp_path).create()
+    with pytest.raises(ValueError, match=r"already used; continue with --resume or choose another --out"):
+        RunFolder(tmp_path).check_free(resumable=True)
     assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
 
 

@@ -40,6 +40,8 @@ def made_up(rounds=16, seeds=1, d=2, known=True, **changes):
                 "seconds": 1.5,
                 "simulations_per_second": 133.0,
                 "diverged": 0,
+                "diverged_target": 0,
+                "masked": 0,
                 "nonfinite": 0,
                 "overfit": False,
                 "overconfident": False,

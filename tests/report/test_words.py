@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from bayessim_jax.report.words import headline, number, plus_minus, worries
+from bayessim_jax.report.words import collapses, headline, number, plus_minus, worries
 from tests.report.made_up import made_up
 
 
@@ -52,10 +52,11 @@ def test_several_seeds_are_summed_up():
     [
         ({"overconfident": True, "coverage90": 0.6}, "over-confident: only 60%"),
         ({"overfit": True}, "over-fitted after its best epoch"),
-        ({"collapsed": True}, "collapsed in 4 rounds"),
         ({"strangeness": 12.0}, "unlike what is simulated: it lies 12 standard deviations"),
         ({"prior_share": 1.0}, "no usable posterior"),
         ({"diverged": 2}, "8 simulations gave numbers that are not finite"),
+        ({"diverged_target": 1}, "4 recordings of the target held numbers that are not finite"),
+        ({"masked": 3}, "12 steps of the learner's simulations"),
         ({"nonfinite": 1}, "4 updates"),
         ({"gain_over_prior": -0.5}, "confidently wrong"),
         ({"gain_over_prior": None}, "confidently wrong"),
@@ -66,6 +67,14 @@ def test_each_reason_for_distrust_is_told(change, word):
     calm = {"level_true": 0.4, "gain_over_prior": 2.0, "coverage90": 0.9}
     assert worries(made_up(rounds=4, **calm)) == []
     assert [text for text in worries(made_up(rounds=4, **calm | change)) if word in text]
+
+
+def test_a_collapse_is_a_reason_for_distrust_where_nothing_corrects_it():
+    run = made_up(rounds=4, seeds=3, collapsed=True, level_true=0.4, gain_over_prior=2.0, coverage90=0.9)
+    assert collapses(run).startswith("The posterior of the networks alone collapsed in 4 rounds: down to 70%")
+    assert worries(run) == []
+    run.settings["proposal"] = "paper"
+    assert [text for text in worries(run) if "collapsed in 4 rounds" in text and "Nothing widens it" in text]
 
 
 def test_seeds_that_miss_their_truth_too_often_are_told():

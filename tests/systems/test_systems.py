@@ -140,8 +140,12 @@ def test_from_functions_makes_a_system():
 @pytest.mark.parametrize(
     ("slip", "message"),
     [
-        ({"step": lambda theta, state, action: jnp.zeros(2)}, "step returned a state of shape"),
-        ({"step": lambda theta, state, action: (state, state)}, "step returned a state of shape"),
+        ({"step": lambda theta, state, action: jnp.zeros(2)}, r"a state of float32\[2\]; reset made float32\[1\]"),
+        ({"step": lambda theta, state, action: (state, state)}, r"a state of .*; reset made float32\[1\]"),
+        ({"reset": lambda key, theta: jnp.zeros(1, int)}, r"a state of float32\[1\]; reset made int32\[1\]"),
+        ({"noise": -0.1}, "noise is -0.1; it is a standard deviation"),
+        ({"noise": [0.1, 0.1]}, "noise is .*for all 1 observations or for each"),
+        ({"dt": 0.0}, "dt is 0.0; it is the control period"),
         ({"observe": lambda theta, state: jnp.zeros(3)}, r"observe returned shape \(3,\).*\('x',\)"),
         ({"step": lambda theta, state, action: state / 0.0 * 0.0}, "non-finite observations.*θ = .0.5."),
     ],
