@@ -90,10 +90,11 @@ class Discrete:
 class Recording:
     """One trajectory of `steps` transitions, measured or simulated, padded to a fixed length.
 
-    Row t of `observations` is what was measured at `times[t]`; `actions[t]` is held from `times[t]` to `times[t + 1]`.
-    `valid[t]` says that transition t, from row t to row t + 1, happened: it is false after the episode ended, in gaps
-    and from the first non-finite number on, and every padded entry is zero. `diverged` says that the simulation
-    produced a non-finite number: such a recording is counted and takes part in nothing.
+    Row t of `observations` is what was measured at `times[t]` (s), in the system's units; `actions[t]` is held from
+    `times[t]` to `times[t + 1]`. `valid[t]` says that transition t, from row t to row t + 1, happened: it is false
+    after the episode ended, in gaps and from the first non-finite number on, and every padded entry is zero.
+    `diverged` says that the simulation produced a non-finite number: such a recording is counted and takes part in
+    nothing. `rollout.assemble` makes one of arrays.
     """
 
     times: Float[Array, " rows"]

@@ -18,7 +18,8 @@ class SimulatedTarget:
     """A system with hidden parameters θ*, in the units of `system.parameters`; θ* is a leaf, so targets batch."""
 
     system: System[Any]
-    task: Task[Any]
+    task: Task[Any] | None
+    """What is paid for; None for no reward, and episodes that never end."""
     theta: Float[Array, " d"]
 
     def record(self, key: PRNGKeyArray, policy: Policy, steps: int) -> Recording:

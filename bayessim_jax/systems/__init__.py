@@ -48,7 +48,11 @@ class Entry:
 
 SYSTEMS: dict[str, Entry] = {
     "cartpole": Entry(
-        CartPole.create, Balance, "ppo", "keep a pole upright on a cart that is pushed left or right", Centre
+        CartPole.create,
+        Balance,
+        "ppo",
+        "keep a pole upright on a cart that is pushed left or right; length is half the pole's",
+        Centre,
     ),
     "pendulum": Entry(
         Pendulum.create, SwingUp, "sac", "swing a rod up with a motor too weak to lift it at once", Upswing
