@@ -148,7 +148,10 @@ class CaseModel:
         )
 
     def inputs(self, windows: Windows) -> Inputs:
-        """Initial states and commands; what came before, for effects that remember it, with smoothed motion."""
+        """Initial states and commands; what came before, for effects that remember it, with smoothed motion.
+
+        Effects with a time of their own count from a recording's first row, whatever its clock says there.
+        """
         before = math.ceil(self.before / self.system.dt - 1e-9)
         shapes = (windows.ctrl, windows.qpos, windows.qvel)
         past, places, rates = (np.zeros((len(windows), before, x.shape[-1])) for x in shapes)
@@ -163,7 +166,8 @@ class CaseModel:
                 past[w], rates[w] = recording.ctrl[rows], smooth.qvel[rows]
                 places[w] = _coast(self, smooth.qpos[rows], rates[w] * early[:, None])
         place = windows.sensors[:, 0] if isinstance(self.system, Restarted) else windows.qpos[:, 0]
-        first = (place, windows.qvel[:, 0], windows.ctrl, past, windows.start)
+        since = windows.start - np.array([self.recordings[k].time[0] for k in windows.recording])
+        first = (place, windows.qvel[:, 0], windows.ctrl, past, since)
         motion = (jax.device_put(places), jax.device_put(rates))
         return Inputs(*map(jax.device_put, first), motion=motion, unrecorded=jax.device_put(unrecorded))
 

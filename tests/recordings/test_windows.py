@@ -1,11 +1,13 @@
 """Masks, windows and resampling of recordings with gaps, jitter and missing numbers."""
 
+import jax
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
 from bayessim_jax.recordings.loading import load_case
 from bayessim_jax.recordings.recording import resample
+from bayessim_jax.recordings.shots import case_model
 from bayessim_jax.recordings.windows import find_windows, stack_windows
 from bayessim_jax.recordings.wording import CaseError
 from tests.recordings.made_up_case import columns, csv_text, write_case
@@ -197,6 +199,20 @@ def test_resampling_to_its_own_rows_changes_nothing(tmp_path):
         np.testing.assert_allclose(getattr(same, name), getattr(recording, name), atol=1e-9)
     with pytest.raises(ValueError, match="dt is 0"):
         resample(recording, 0)
+
+
+def test_effects_count_time_from_the_first_row_of_a_recording(tmp_path):
+    """A log that is cut out of a longer one, or has the clock of the day, is simulated as one that begins at zero."""
+    late = columns()
+    late["time"] = late["time"] + 4096.0
+    cases = (loaded(tmp_path / "a"), loaded(tmp_path / "b", run1=late))
+    models = [case_model(case.check(), before=0.1) for case in cases]
+    windows = [model.windows([0]) for model in models]
+    np.testing.assert_allclose(windows[1].start - windows[0].start, 4096.0)
+    prompt, shifted = (model.inputs(w) for model, w in zip(models, windows, strict=True))
+    assert float(prompt.time[0]) == 0.0 and float(prompt.time[-1]) > 0.0
+    for a, b in zip(jax.tree.leaves(prompt), jax.tree.leaves(shifted), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)
 
 
 def test_the_first_error_stops_and_the_others_are_counted(tmp_path):
