@@ -16,6 +16,7 @@ Source: Possas et al. 2020, Algorithm 1
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -128,12 +129,12 @@ class Setup:
         for name, value in sizes.items():
             if value < (0 if name in ("evaluations", "warmup", "inferences", "calibrations", "kept") else 1):
                 raise ValueError(f"Setup: {name} is {value}; it must be a positive number.")
+        history, recordings = sizes.get("history", cls.history), sizes.get("recordings", cls.recordings)
         if not sizes.get("calibrations"):
-            sizes["calibrations"] = min(max(SETS // sizes.get("history", cls.history), FEWEST), MOST)
+            sizes["calibrations"] = min(max(SETS // history, FEWEST), MOST)
         sizes["kept"] = min(sizes.get("kept", 0), sizes["calibrations"])
         if not 0 <= forget < 1:
             raise ValueError(f"Setup: forget is {forget}; it is a probability, from 0 to below 1.")
-        history, recordings = sizes.get("history", cls.history), sizes.get("recordings", cls.recordings)
         if history % recordings:
             raise ValueError(
                 f"Setup: history is {history}, no multiple of recordings, {recordings}, so a round's would not be "
@@ -300,11 +301,7 @@ def evaluate(key: PRNGKeyArray, setup: Setup, target: Target, state: State) -> d
     policy, task = setup.learner.policy(state.learner, deterministic=True), setup.task
     keys = jax.random.split(jax.random.fold_in(key, state.round), setup.evaluations)
     seen = jax.vmap(lambda k: target.record(k, policy, task.steps))(keys)
-    sound = ~seen.diverged
-
-    def mean(values: Array) -> Scalar:
-        return jnp.mean(values, where=sound)
-
+    mean = partial(jnp.mean, where=~seen.diverged)
     returns = seen.rewards.sum(-1)
     return {
         "return_target": mean(returns),

@@ -7,8 +7,8 @@
 The target is simulated, with the stated sensor noise; actions are random. A calibrated 50 % set holds the truth in half
 of the runs, a 90 % set in nine of ten, and the ranks of the truth among the posterior's draws are uniform: p is that of
 the χ² test, the least over the parameters. `networks` is the coverage of 90 % sets before recalibration, on simulated
-sets. After ± stands the standard error, where coverage is concerned that of a calibrated posterior. `--kept` prints
-what `--out` holds.
+sets. After ± stands the standard error, where coverage is concerned that of a calibrated posterior. `least` is the log
+q(θ*) of the worst run. `--kept` prints what `--out` holds.
 """
 
 from __future__ import annotations
@@ -48,8 +48,9 @@ def main() -> None:
     args = parser.parse_args()
     if args.kept and args.out is None:
         parser.error("--kept: name the file that holds the runs with --out")
-    print("| proposal | recordings a round | rounds | draws | 50 % sets | 90 % sets | rank p | networks | log q(θ*) |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    measures = "50 % sets | 90 % sets | rank p | networks | log q(θ*) | least"
+    print(f"| proposal | recordings a round | rounds | draws | {measures} |")
+    print("|---|---|---|---|---|---|---|---|---|---|")
     for proposal, rounds, recordings in product(args.proposals, args.rounds, args.recordings):
         labels = {"system": args.system, "proposal": proposal, "recordings": recordings}
         if args.kept:
@@ -81,7 +82,8 @@ def _row(results: Sequence[dict[str, Any]]) -> str:
     p = uniformity_test(jnp.asarray(rank * DRAWS).round(), DRAWS, bins)[1].min() if bins > 1 else float("nan")
     error = log_q.std(ddof=1) / np.sqrt(n) if n > 1 else float("nan")
     held = (f"{(level <= a).mean():.3f} ± {np.sqrt(a * (1 - a) / n):.3f}" for a in (0.5, 0.9))
-    return f"{n} | {' | '.join(held)} | {p:.3f} | {network.mean():.2f} | {log_q.mean():.2f} ± {error:.2f}"
+    scores = f"{network.mean():.2f} | {log_q.mean():.2f} ± {error:.2f} | {log_q.min():.2f}"
+    return f"{n} | {' | '.join(held)} | {p:.3f} | {scores}"
 
 
 if __name__ == "__main__":

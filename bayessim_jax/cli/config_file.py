@@ -39,9 +39,8 @@ def settings_from(tables: Mapping[str, Any], where: str) -> dict[str, Any]:
         if key not in hints:
             raise UsageError(f"{where}: unknown key {key!r}: {near_miss(key, hints)}")
         checked[key] = _check(value, hints[key], f"{where}: {key}")
-    for name, bounds in checked.get("prior", {}).items():
-        if not bounds[0] < bounds[1]:
-            low, high = bounds
+    for name, (low, high) in checked.get("prior", {}).items():
+        if not low < high:
             raise UsageError(f"{where}: prior.{name}: low {low} must be below high {high}; swap or widen the bounds.")
     return checked
 

@@ -85,13 +85,13 @@ class Session:
     def _rounds(self, facts: dict[str, Any], reporter: Reporter, interruption: Interruption, journal: Journal) -> int:
         rounds, started = self.plan.settings.rounds, time.perf_counter()
         begun = journal.checkpoints.latest is not None or (self.folder.path / "metrics.jsonl").exists()
-        if self.resume and begun:
+        if begun:
             self._refuse_another(journal)
         for remark in self.plan.remarks:
             reporter.say(remark)
         reporter.stage("compiling; this is quick the next time")
         state, done = self.plan.start(), 0
-        if self.resume and begun:
+        if begun:
             done, state = self._take_up(journal, state)
         if self.resume:
             self._open(facts, self.folder.read_run())

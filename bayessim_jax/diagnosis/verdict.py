@@ -238,6 +238,11 @@ class Diagnosis:
         best = self.confusion[0] if self.confusion else self.taken_back
         return best or (self.entries[0] if self.entries else self.baseline)
 
+    @property
+    def answer(self) -> Entry:
+        """What is simulated from now on: what the verdict names, and where it names nothing the simulator as it is."""
+        return self.best if self.names_something else self.baseline
+
 
 def share_left(after: Misfit, before: Misfit) -> float:
     """Share of a misfit that a candidate leaves in the windows judged, both in units of the smaller noise."""

@@ -245,5 +245,5 @@ def judge(
         widen=widen,
         overconfident=coverage90 < 0.9 - 5.0 * jnp.sqrt(0.09 / count),
         collapsed=network < halved - 3.0 * jnp.sqrt(halved * (1.0 - halved) / count),
-        nonfinite=jnp.asarray(nonfinite),
+        nonfinite=jnp.array(nonfinite),
     )

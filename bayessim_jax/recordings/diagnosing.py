@@ -427,7 +427,6 @@ def diagnose_case(
     if result.verdict == "unexplained":
         result.sooner = _test_sooner(key, explained, thresholds)
     located = result.verdict != "no_mismatch"
-    answers = result.confusion if result.names_something else [result.baseline]
     return CaseDiagnosis(
         model=model,
         bench=bench,
@@ -447,7 +446,7 @@ def diagnose_case(
         noise_floor=floor,
         theta={
             "baseline": moments_of_theta(bench, [result.baseline], [1.0]),
-            "augmented": moments_of_theta(bench, answers, result.probabilities or [1.0]),
+            "augmented": moments_of_theta(bench, result.confusion or [result.baseline], result.probabilities or [1.0]),
         },
         experiment=next_experiment(model, bench, result, shots),
         absorbed=_absorbed(taken.problem, none),

@@ -34,14 +34,14 @@ STATE = "simulators.json"
 
 def write_state(folder: RunFolder, diagnosis: CaseDiagnosis) -> None:
     """Write `simulators.json`: parameters, effects and spreads of errors of every simulator of a diagnosis."""
-    bench, result, entries = diagnosis.bench, diagnosis.result, {}
-    answer = {"baseline": result.baseline, "augmented": result.best if result.names_something else result.baseline}
+    bench, entries = diagnosis.bench, {}
+    named = {"baseline": diagnosis.result.baseline, "augmented": diagnosis.result.answer}
     for name in diagnosis.scores:
         if name == "flexible":
             assert diagnosis.flexible is not None and diagnosis.flexible_bench is not None
             own, candidate, last = diagnosis.flexible_bench, diagnosis.flexible.candidate, diagnosis.flexible.p
         else:
-            entry = answer[name]
+            entry = named[name]
             own, candidate, last = bench, entry.candidate, entry.fit.z
         x: Any = np.asarray(last)
         entries[name] = {
@@ -51,7 +51,7 @@ def write_state(folder: RunFolder, diagnosis: CaseDiagnosis) -> None:
             "values": list(own.values(candidate, x).values()),
             "spread": diagnosis.spreads[diagnosis.augmented if name == "augmented" else name].tolist(),
         }
-    for name, entry in answer.items():
+    for name, entry in named.items():
         entries[name]["noise"] = entry.misfit.noise.tolist()
     state = {
         "schema": 1,

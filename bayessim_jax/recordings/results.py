@@ -95,9 +95,7 @@ def _found(diagnosis: CaseDiagnosis) -> list[tuple[Any, str, dict[str, float]]]:
 
 def _write_laplace(path: Path, diagnosis: CaseDiagnosis, seed: int) -> None:
     """Groups `prior` and `posterior`: the case's parameters and those of the effects found, by Laplace."""
-    bench, entry, margins = diagnosis.bench, diagnosis.result.best, diagnosis.model.margins
-    named = diagnosis.result.names_something
-    entry = entry if named else diagnosis.result.baseline
+    bench, entry, margins = diagnosis.bench, diagnosis.result.answer, diagnosis.model.margins
     rng = np.random.default_rng(seed)
     columns = bench.columns(entry.candidate)
     size = bench.d + len(columns)

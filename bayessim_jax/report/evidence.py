@@ -55,6 +55,11 @@ class OnlineRun:
         return bool(np.isfinite(self.series("log_q_validation")).any())
 
     @property
+    def corrected(self) -> bool:
+        """Whether posteriors are corrected by simulated sets: by all proposals but the paper's."""
+        return self.settings.get("proposal") != "paper"
+
+    @property
     def change(self) -> tuple[int, str] | None:
         """The round from which the target is another one, and in what."""
         told = dict(self.settings.get("change") or {})

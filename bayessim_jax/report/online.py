@@ -178,7 +178,7 @@ def _calibration(run: OnlineRun) -> list[str]:
         "simulations trained on and held out; a widening gap is over-fitting. Orange crosses mark rounds that raised a "
         "flag."
     )
-    if run.settings.get("proposal") != "paper" and (told := collapses(run)):
+    if run.corrected and (told := collapses(run)):
         caption += f" {told} The correction takes that out, at the price of a wider posterior."
     parts = [html.figure(svg, "Coverage on held-out simulations and fit scores against rounds.", caption, wide=True)]
     if run.truths is not None and len(run.seeds) > 1:
@@ -196,7 +196,7 @@ def _calibration(run: OnlineRun) -> list[str]:
 
 def _corrected_by(run: OnlineRun) -> str:
     """What the posteriors whose coverage is shown were corrected with."""
-    if run.settings.get("proposal") == "paper":
+    if not run.corrected:
         return ""
     if run.settings.get("history") == 1:
         return ", corrected by those of the other half"

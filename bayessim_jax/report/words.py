@@ -119,7 +119,7 @@ def worries(run: OnlineRun) -> list[str]:
             "Something is missing in the simulator, or the belief has lost the truth; what the simulator lacks is read "
             "as parameters, so do not trust the posterior."
         )
-    if run.settings.get("proposal") == "paper" and (told := collapses(run)):
+    if not run.corrected and (told := collapses(run)):
         found.append(f"{told} Nothing widens it under the paper's proposals; more simulations a round make it better.")
     if (n := int(np.nansum(at("overconfident")))) > 0:
         share = float(np.nanmin(at("coverage90")))  # of the last round that inferred, as everything here
