@@ -114,7 +114,7 @@ class Setup:
         task: Task[Any] | None = None,
         *,
         estimator: Estimator[Any] | None = None,
-        proposal: str | ProposalMode = "corrected",
+        proposal: str | ProposalMode = "truncated",
         replay: bool = False,
         forget: float = 0.0,
         **sizes: int,

@@ -38,7 +38,7 @@ def main() -> None:
     """Run the trials and print a row for each proposal and size of the sets."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--system", choices=SYSTEMS, default="cartpole")
-    parser.add_argument("--proposals", nargs="+", choices=PROPOSALS, default=["corrected"])
+    parser.add_argument("--proposals", nargs="+", choices=PROPOSALS, default=["truncated"])
     parser.add_argument("--recordings", type=int, nargs="+", default=[1, 4, 16], help="of the target, in each round")
     parser.add_argument("--rounds", type=int, nargs="+", default=[1, 10], help="after which the posterior is judged")
     parser.add_argument("--runs", type=int, default=300)

@@ -5,7 +5,7 @@
     python scripts/reproduce_table1.py --kept --out benchmarks/results/table1.jsonl
 
 The paper's setting is 30 rounds of 200 trajectories of 50 steps, with the controller trained along the way. Columns:
-`default` (recurrent network, corrected proposals), `paper` (the paper's proposals), `rff` and `epsilon_free` (summary
+`default` (recurrent network, truncated proposals), `paper` (the paper's proposals), `rff` and `epsilon_free` (summary
 statistics, in the same loop). The targets of Hopper and Fetch are Gymnasium's environments, Hopper's simulator is Brax;
 Fetch warms up on the prior, and all three calibrate on fewer sets, as `bayessim online` does. Scores are in raw units,
 and in units of the prior's width, which is the gain over the prior; those of the acrobot's masses and lengths, and
@@ -42,10 +42,10 @@ PAPER = {
 }
 """What the paper gives: online, RFF and epsilon-free; for each pair of axes that it judges."""
 COLUMNS = {
-    "default": ("", "corrected", 0),
+    "default": ("", "truncated", 0),
     "paper": ("", "paper", 0),
-    "rff": ("fourier", "corrected", 1),
-    "epsilon_free": ("summary", "corrected", 2),
+    "rff": ("fourier", "truncated", 1),
+    "epsilon_free": ("summary", "truncated", 2),
 }
 """Encoder, or the system's default, proposals, and which of the paper's figures stands beside it."""
 OF_OTHERS = ("hopper", "fetch_push", "fetch_slide")

@@ -16,7 +16,7 @@ from bayessim_jax.control import default_planner
 from bayessim_jax.engines.simulated import SimulatedTarget
 from bayessim_jax.inference import Lstm, MixtureHead, Schedule, recurrent_mixture
 from bayessim_jax.inference.estimators import MixtureDensity
-from bayessim_jax.inference.proposals import Corrected
+from bayessim_jax.inference.proposals import TruncatedPrior
 from bayessim_jax.learning import Fixed, Ppo, RandomPolicy, RecordedActions, default_learner
 from bayessim_jax.rollout import rollout
 from bayessim_jax.systems import Balance, CartPole, Pendulum, SkidSteer, Upswing, from_functions
@@ -332,7 +332,7 @@ def test_a_wider_posterior_that_agrees_leaves_the_belief_and_one_that_disagrees_
         return Truncated.create(mixture, box)
 
     @struct.dataclass
-    class Given(Corrected):
+    class Given(TruncatedPrior):
         """A proposal mode whose posterior is given."""
 
         answer: Truncated | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from bayessim_jax.beliefs.mixture import GaussianMixture
 from bayessim_jax.beliefs.triangular import factor, invert, log_normal
@@ -36,34 +36,42 @@ def product(a: GaussianMixture, b: GaussianMixture) -> GaussianMixture:
 
 
 def quotient(
-    numerator: GaussianMixture, mean: Float[Array, " d"], scale_tril: Float[Array, "d d"]
-) -> tuple[GaussianMixture, Bool[Array, " components"]]:
-    """The pointwise quotient by one Gaussian N(mean, L Lᵀ), and which components have one.
+    numerator: GaussianMixture,
+    mean: Float[Array, " d"],
+    scale_tril: Float[Array, "d d"],
+    spread: float | Scalar = 1.0,
+    reach: float | Scalar = 3.0,
+) -> GaussianMixture:
+    """The quotient by one Gaussian N(mean, L Lᵀ), exact as far as it stays where that Gaussian has its mass.
 
-    In natural parameters Λ = Λₖ − Λ₀ and η = ηₖ − η₀. A component is valid where Λ is positive definite, that is where
-    it is narrower than the divisor in every direction; one that is not keeps its weight, mean and scale.
+    In the coordinates L⁻¹ (θ − mean), turned so that a component's covariance is diagonal, each of its axes has a
+    variance λ and a mean c, and is divided by the power κ of the divisor's:
+
+        N(x; c, λ) / exp(−κ x²/2)  ∝  N(x; c/g, λ/g),   g = 1 − κ λ
+
+    κ is 1, or the most that leaves λ/g at or below spread² and |c|/g at or below `reach`: a component that is almost as
+    wide as the divisor would have its quotient far outside, and one that is wider has none. Such an axis stays nearer
+    to what it was; with κ = 0 it is as it was. The log-sum-exp of the weights returned is log ∫ of the quotient.
     """
 
-    def divide(log_weight: Scalar, mu: Array, tril: Array) -> tuple[Scalar, Array, Array, Array]:
-        relative = invert(scale_tril) @ tril
-        gram = relative.T @ relative
-        margin = 64 * jnp.finfo(gram.dtype).eps
-        valid = jnp.linalg.eigvalsh(jax.lax.stop_gradient(gram))[-1] < 1 - margin
-        eye = jnp.eye(mu.size, dtype=gram.dtype)
-        root = jnp.linalg.cholesky(jnp.where(valid, eye - gram, eye))
-        wide = factor(tril @ invert(root).T)
-        pull = invert(scale_tril).T @ (invert(scale_tril) @ (mu - mean))
-        moved = mu + wide @ (wide.T @ pull)
-        log_ratio = -log_normal(mean - moved, factor(jnp.concatenate([scale_tril, wide], axis=1)))
+    def divide(log_weight: Scalar, mu: Array, tril: Array) -> tuple[Scalar, Array, Array]:
+        tiny = jnp.finfo(tril.dtype).tiny
+        relative, gap = invert(scale_tril) @ tril, invert(scale_tril) @ (mu - mean)
+        turn = jnp.linalg.eigh(relative.T @ relative)[1]
+        axes = relative @ turn
+        variance = (axes**2).sum(0) + tiny
+        pull = axes.T @ gap
+        least = jnp.maximum(variance / spread**2, jnp.abs(pull) / jnp.sqrt(variance) / reach)
+        power = jnp.clip((1 - least) / variance, 0.0, 1.0)
+        left = 1 - power * variance
+        gain = 0.5 * (power * pull**2 / (variance * left) - jnp.log(left)).sum()
         return (
-            jnp.where(valid, log_weight + log_ratio, log_weight),
-            jnp.where(valid, moved, mu),
-            jnp.where(valid, wide, tril),
-            valid,
+            log_weight + gain - log_normal(jnp.zeros_like(mean), scale_tril),
+            mu + tril @ turn @ (power * pull / left),
+            factor(tril @ (turn / jnp.sqrt(left))),
         )
 
-    log_weights, means, trils, valid = jax.vmap(divide)(*_leaves(numerator))
-    return GaussianMixture(log_weights, means, trils), valid
+    return GaussianMixture(*jax.vmap(divide)(*_leaves(numerator)))
 
 
 def reduce(mixture: GaussianMixture, count: int) -> GaussianMixture:

@@ -140,9 +140,9 @@ class Settings:
     """How a recording is read: a fast LSTM over pooled frames, the paper's LSTM, transitions averaged with weights that
     are learned, or hand-made summaries with and without random Fourier features (the BayesSim RFF and epsilon-free
     baselines)."""
-    proposal: Literal["corrected", "paper", "truncated"] = "corrected"
-    """Where to simulate in the next round: around the belief, which is divided out again (corrected); where the paper
-    does; or from the prior, on a box around the belief (truncated)."""
+    proposal: Literal["corrected", "paper", "truncated"] = "truncated"
+    """Where to simulate in the next round: from the prior, on an ellipsoid around the belief (truncated); where the
+    paper does; or from a Gaussian around the belief, which is divided out again (corrected)."""
     simulations: int = 200
     """Parameters simulated in a round."""
     steps: int = 50

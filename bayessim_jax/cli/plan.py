@@ -201,7 +201,13 @@ def _make_plan(settings: Settings) -> Plan:
         schedule=pace,
         learner={name: value for name, value in habits.items() if value is not None},
     )
-    return Plan(complete, setup, target, seeds, hidden, subject.remarks)
+    remarks = subject.remarks
+    if setup.inferences and setup.warmup >= settings.rounds:
+        remarks += (
+            f"warmup is {setup.warmup} and rounds is {settings.rounds}: nothing is recorded or inferred; for that take "
+            f"--rounds {setup.warmup + 1} or more.",
+        )
+    return Plan(complete, setup, target, seeds, hidden, remarks)
 
 
 def _kind(settings: Settings, system: Any) -> str:

@@ -1,14 +1,15 @@
 """The posterior of θ by simulation: networks that read whole sets of windows, trained where the posterior lies.
 
-θ is drawn from the prior cut to a box around what is believed, and all windows of the recordings are simulated with it
-at once: from their own initial states, corrected by δ ~ N(0, S²), under their own commands, with noise of a level near
-the estimate, σ exp(ε/√(2n)) for n numbers. The networks learn q(θ | all windows), so that nothing has to be multiplied.
+θ is drawn from the prior cut to an ellipsoid around what is believed, and all windows of the recordings are simulated
+with it at once: from their own initial states, corrected by δ ~ N(0, S²), under their own commands, with noise of a
+level near the estimate, σ exp(ε/√(2n)) for n numbers. The networks learn q(θ | all windows), so that nothing has to be
+multiplied.
 Their posterior, recalibrated on sets that they were not trained on, is where the next round simulates; rounds end when
 posteriors no longer shrink.
 
-What a network reads of every window is what was measured, what the simulation at the box's centre θ₀ missed in units of
-σ, the commands, and the score Sᵀr of every row: the derivatives of the predictions, less what initial states can
-absorb, times what was missed. Beside them stands the step from θ₀ that all scores together ask for. As the box shrinks
+What a network reads of every window is what was measured, what the simulation at the ellipsoid's centre θ₀ missed in
+units of σ, the commands, and the score Sᵀr of every row: the derivatives of the predictions, less what initial states
+can absorb, times what was missed. Beside them stands the step from θ₀ that all scores together ask for. As it shrinks
 towards a linear simulator these are sufficient; what is not linear, the networks learn.
 
 Source: Deistler et al. 2022 (truncated rounds); Alsing and Wandelt 2018 (scores as summaries)
@@ -27,7 +28,7 @@ from flax import struct
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from bayessim_jax.beliefs import Truncated, Uniform
+from bayessim_jax.beliefs import Ellipsoid, Truncated
 from bayessim_jax.beliefs.margins import Margins
 from bayessim_jax.contracts import Box, Recording
 from bayessim_jax.inference.draws import Coverage, PosteriorDraws
@@ -181,7 +182,7 @@ def _prior(d: int) -> Truncated:
         return Truncated.uniform(Box(jnp.zeros(d), jnp.ones(d), names, ("",) * d), COMPONENTS)
 
 
-def _propose(key: PRNGKeyArray, belief: Truncated) -> tuple[Uniform, Float[Array, "n d"]]:
+def _propose(key: PRNGKeyArray, belief: Truncated) -> tuple[Ellipsoid, Float[Array, "n d"]]:
     with jax.enable_x64(False):
         proposal = TruncatedPrior().propose(belief)
         keys = jax.random.split(key, SIMULATIONS + CALIBRATIONS)
@@ -231,7 +232,7 @@ def _learn(
     points: Float[Array, "n d"],
     simulated: Recording,
     recorded: Recording,
-    proposal: Uniform,
+    proposal: Ellipsoid,
     belief: Truncated,
 ) -> tuple[Truncated, CalibrationInfo]:
     """The posterior of what was recorded, by networks fitted to the first simulations and corrected by the others."""

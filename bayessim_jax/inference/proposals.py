@@ -10,6 +10,7 @@ whether X is every recording so far or this round's alone.
 
 from __future__ import annotations
 
+import math
 from typing import Any, Protocol
 
 import jax
@@ -17,8 +18,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from bayessim_jax.beliefs import GaussianMixture, Truncated, Uniform, quotient, reduce
-from bayessim_jax.contracts import Belief, Box
+from bayessim_jax.beliefs import Ellipsoid, GaussianMixture, Truncated, quotient, reduce
+from bayessim_jax.contracts import Belief
 from bayessim_jax.spelling import find_named
 
 __all__ = ["PROPOSALS", "Corrected", "Paper", "ProposalMode", "TruncatedPrior", "lookup_proposal", "pool_weights"]
@@ -87,33 +88,33 @@ class Corrected:
 
     def combine(self, belief: Truncated, proposal: Truncated, q: GaussianMixture) -> Truncated:
         """The quotient q / p̃ on the prior's box; q itself where p̃ was the prior."""
-        divided, _ = quotient(q, proposal.mixture.means[0], proposal.mixture.scale_trils[0])
+        divided = quotient(q, proposal.mixture.means[0], proposal.mixture.scale_trils[0])
         first = proposal.prior_share > 0.5
         return _fitted(jax.tree.map(lambda a, b: jnp.where(first, a, b), q, divided), belief)
 
 
 @struct.dataclass
 class TruncatedPrior:
-    """Simulate from the prior cut to a box around the belief.
+    """Simulate from the prior cut to an ellipsoid around the belief.
 
-    p̃ is constant on the box, so nothing is divided out, and simulations of all rounds that fall in it are alike.
+    p̃ is constant on {θ : |L⁻¹ (θ − m)| ≤ c √(d + 2)}, m and L Lᵀ the moments of the belief in the prior's box, so that
+    its own standard deviations are c times those of the belief, as far as the box leaves it whole. Nothing is divided
+    out, and simulations of all rounds that fall in it are alike.
 
     Source: Deistler et al. 2022
     """
 
-    reach: float | Array = 5.0
-    """Half the box, in standard deviations of the belief."""
+    widening: float | Array = 2.5
+    """c: standard deviations of the proposal over those of the belief."""
     reuse: bool = struct.field(pytree_node=False, default=True)
     accumulate: bool = struct.field(pytree_node=False, default=True)
 
-    def propose(self, belief: Truncated) -> Uniform:
-        """The prior on mean ± reach · sd."""
-        mean, sd = belief.mean(), jnp.sqrt(jnp.diagonal(belief.covariance()))
-        low = jnp.maximum(belief.box.low, mean - self.reach * sd)
-        high = jnp.minimum(belief.box.high, mean + self.reach * sd)
-        return Uniform(Box(low, high, belief.box.names, belief.box.units))
+    def propose(self, belief: Truncated) -> Ellipsoid:
+        """The prior on the ellipsoid; the prior itself while the belief is the prior."""
+        half_axes = self.widening * math.sqrt(belief.box.size + 2) * jnp.linalg.cholesky(belief.covariance())
+        return Ellipsoid.create(belief.mean(), half_axes, belief.box, belief.prior_share > 0.5)
 
-    def combine(self, belief: Truncated, proposal: Uniform, q: GaussianMixture) -> Truncated:
+    def combine(self, belief: Truncated, proposal: Ellipsoid, q: GaussianMixture) -> Truncated:
         """The network's answer on the prior's box."""
         return _fitted(q, belief)
 

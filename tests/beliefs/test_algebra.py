@@ -9,6 +9,7 @@ from bayessim_jax.beliefs import GaussianMixture, moment_match, product, quotien
 
 THETAS = jnp.asarray(np.random.default_rng(9).normal(size=(40, 3)), jnp.float32)
 multiply, divide = jax.jit(product), jax.jit(quotient)
+FAR = 1e3, 1e3  # nothing is held back
 merge = jax.jit(reduce, static_argnames="count")
 density = jax.jit(jax.vmap(lambda m, t: m.log_prob(t), (None, 0)))
 
@@ -65,8 +66,7 @@ def test_product_bears_very_different_scales():
 def test_quotient_undoes_a_product():
     a, (mean, tril) = random_mixture(8), moment_match(random_mixture(9))
     ag = multiply(a, single(mean, tril))
-    back, valid = divide(ag, mean, tril)
-    assert valid.all()
+    back = divide(ag, mean, tril, *FAR)
     np.testing.assert_allclose(back.means, a.means, atol=2e-3)
     np.testing.assert_allclose(back.scale_trils, a.scale_trils, atol=2e-3)
     np.testing.assert_allclose(back.weights, a.weights, atol=2e-3)
@@ -75,27 +75,49 @@ def test_quotient_undoes_a_product():
 
 def test_quotient_is_the_pointwise_quotient():
     a, mean, tril = random_mixture(10), jnp.array([0.3, -0.2, 0.1]), 4 * jnp.eye(3)
-    q, valid = divide(a, mean, tril)
-    assert valid.all()
+    q = divide(a, mean, tril)
     difference = density(q, THETAS) - (density(a, THETAS) - density(single(mean, tril), THETAS))
     np.testing.assert_allclose(difference, -jax.nn.logsumexp(q.log_weights), atol=2e-3)
 
 
-def test_quotient_by_a_narrower_gaussian_is_flagged_and_left_alone():
+def test_quotient_by_a_narrower_gaussian_leaves_shape_and_share_alone():
     a = random_mixture(11)
-    wide = a.replace(scale_trils=a.scale_trils.at[1].set(5 * jnp.eye(3)))
-    q, valid = divide(wide, jnp.zeros(3), 3 * jnp.eye(3))
-    np.testing.assert_array_equal(valid, [True, False, True, True])
-    np.testing.assert_array_equal(q.means[1], wide.means[1])
-    np.testing.assert_array_equal(q.scale_trils[1], wide.scale_trils[1])
-    grads = jax.jit(jax.grad(lambda m: quotient(m, jnp.zeros(3), 3 * jnp.eye(3))[0].log_prob(jnp.ones(3))))(wide)
-    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves((q, grads)))
+    wide = a.replace(means=jnp.zeros((4, 3)), scale_trils=jnp.stack([k * jnp.eye(3) for k in (3.1, 5.0, 8.0, 3.0)]))
+    q = divide(wide, jnp.zeros(3), 3 * jnp.eye(3))
+    np.testing.assert_allclose(q.means, wide.means, atol=1e-6)
+    np.testing.assert_allclose(q.scale_trils, wide.scale_trils, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(q.weights, wide.weights, rtol=1e-5)
 
 
-def test_quotient_needs_every_direction_narrower():
-    slim = single(jnp.zeros(2), jnp.array([[2.0, 0.0], [2.0, 0.01]]))
-    _, valid = divide(slim, jnp.zeros(2), 2.5 * jnp.eye(2))  # each axis is narrower, the diagonal is not
-    assert not valid.any()
+def test_quotient_divides_the_axes_that_are_narrower_whatever_the_others_are():
+    turn = jnp.linalg.qr(jnp.asarray(np.random.default_rng(3).normal(size=(2, 2)), jnp.float32))[0]
+    slim = single(turn @ jnp.array([0.2, 0.5]), jnp.linalg.cholesky(turn @ jnp.diag(jnp.array([0.09, 4.0])) @ turn.T))
+    q = divide(slim, jnp.zeros(2), jnp.eye(2))
+    np.testing.assert_allclose(turn.T @ q.means[0], [0.2 / 0.91, 0.5], atol=1e-5)
+    inner = turn.T @ q.scale_trils[0] @ q.scale_trils[0].T @ turn
+    np.testing.assert_allclose(inner, np.diag([0.09 / 0.91, 4.0]), atol=1e-5)
+
+
+@pytest.mark.parametrize("share", [0.5, 0.9, 0.99, 0.9999, 1.0])
+@pytest.mark.parametrize("off", [0.0, 1.0, 2.9])
+def test_quotient_stays_where_the_divisor_has_its_mass(share, off):
+    """A component that is almost as wide as the divisor would move by off / (1 − share): out of all that was seen."""
+    near = single(jnp.array([off, 0.0]), jnp.sqrt(share) * jnp.eye(2))
+    q = divide(near, jnp.zeros(2), jnp.eye(2))
+    assert (jnp.abs(q.means) <= 3.0 + 1e-4).all()
+    assert (jnp.abs(q.scale_trils) <= 1.0 + 1e-4).all()
+
+
+def test_mass_of_a_quotient_is_its_integral():
+    """Where an axis is not divided whole, too: it is N(θ; μ, σ²) / p̃(θ)^κ, with p̃ scaled to its own at its centre."""
+    narrow, wide, grid = 0.4, 0.9, jnp.linspace(-12, 12, 8001)[:, None]
+    both = GaussianMixture(jnp.log(jnp.array([0.3, 0.7])), jnp.array([[0.5], [1.0]]), jnp.array([[[narrow]], [[wide]]]))
+    q = divide(both, jnp.zeros(1), jnp.eye(1))
+    power = (1 - max(wide**2, 1.0 / 3)) / wide**2  # leaves a variance of one
+    first = 0.3 * jnp.exp(density(single(jnp.array([0.5]), jnp.array([[narrow]])), grid) + 0.5 * grid[:, 0] ** 2)
+    second = 0.7 * jnp.exp(density(single(jnp.array([1.0]), jnp.array([[wide]])), grid) + 0.5 * power * grid[:, 0] ** 2)
+    integral = (first + second).sum() * (grid[1] - grid[0])[0] * jnp.sqrt(2 * jnp.pi)
+    np.testing.assert_allclose(jax.nn.logsumexp(q.log_weights), jnp.log(integral), atol=1e-3)
 
 
 @pytest.mark.parametrize("count", [1, 3, 11])

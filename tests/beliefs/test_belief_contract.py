@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bayessim_jax.beliefs import GaussianMixture, Particles, Truncated, Uniform
+from bayessim_jax.beliefs import Ellipsoid, GaussianMixture, Particles, Truncated, Uniform
 from bayessim_jax.contracts import Belief, Box
 
 BOX = Box.create(length=(0.1, 1.0, "m"), mass=(-1.0, 3.0, "kg"))
@@ -18,6 +18,10 @@ def mixture():
 
 BELIEFS = {
     "uniform": lambda: Uniform(BOX),
+    "ellipsoid": lambda: Ellipsoid.create(jnp.array([0.5, 1.0]), jnp.array([[0.3, 0.0], [-0.8, 0.5]]), BOX),
+    "ellipsoid in a corner": lambda: Ellipsoid.create(
+        jnp.array([0.15, 2.7]), jnp.array([[0.5, 0.0], [-1.5, 0.4]]), BOX
+    ),
     "mixture": mixture,
     "truncated": lambda: Truncated.create(mixture(), BOX, 0.1),
     "prior": lambda: Truncated.uniform(BOX, 2),

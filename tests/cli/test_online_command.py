@@ -176,6 +176,13 @@ def test_a_plan_is_complete_and_repeats():
     np.testing.assert_array_equal(alone.truths.first[0], plan.truths.first[1])
 
 
+def test_a_run_that_only_warms_up_says_so():
+    (told,) = make_plan(Settings("cartpole", rounds=3, warmup=3)).remarks
+    assert told.startswith("warmup is 3 and rounds is 3") and "--rounds 4" in told
+    assert not make_plan(Settings("cartpole", rounds=4, warmup=3)).remarks
+    assert not make_plan(Settings("cartpole", rounds=3, warmup=3, scheme="uniform")).remarks
+
+
 def lines(path):
     read = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
     return [{k: v for k, v in line.items() if k not in ("seconds", "simulations_per_second")} for line in read]

@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -64,3 +66,5 @@ def test_the_line_of_a_round():
     assert line["sd"] == pytest.approx({"length": 0.05, "mass": 0.04})
     assert (line["return_target"], line["return_simulated"]) == (40.0, 20.0)
     assert (line["cost_target"], line["truth"]) == (pytest.approx(0.2), {"length": 0.4, "mass": 0.3})
+    page = (Path(__file__).parents[2] / "docs" / "runs.md").read_text(encoding="utf-8")
+    assert not [key for key in line if f"`{key}`" not in page]
