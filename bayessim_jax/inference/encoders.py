@@ -126,8 +126,8 @@ class Lstm:
             x, valid = pool(x, valid, self.frame)
         # σ(a) = ½ + ½ tanh(a/2): with the halves folded into the weights all four gates are one tanh
         half = jnp.concatenate([jnp.full(3 * h, 0.5), jnp.ones(h)])
-        inputs = jnp.swapaxes(x, 0, 1) @ (params["w"] * half) + params["b"] * half
-        return _lstm(params["u"] * half, inputs, jnp.swapaxes(valid, 0, 1))
+        weights = jnp.concatenate([params["u"], params["w"], params["b"][None]]) * half
+        return _lstm(weights, jnp.swapaxes(x, 0, 1), jnp.swapaxes(valid, 0, 1))
 
 
 def _gates(t: Float[Array, "batch gates"]) -> tuple[Array, Array, Array, Array]:
@@ -136,18 +136,22 @@ def _gates(t: Float[Array, "batch gates"]) -> tuple[Array, Array, Array, Array]:
 
 
 @jax.custom_vjp
-def _lstm(u: Float[Array, "h gates"], inputs: Float[Array, "steps batch gates"], valid: Array) -> Array:
-    return _lstm_forward(u, inputs, valid)[0]
+def _lstm(weights: Float[Array, "h+x+1 gates"], x: Float[Array, "steps batch x"], valid: Array) -> Array:
+    """The rows of `weights` act on h, on x and on 1."""
+    return _lstm_forward(weights, x, valid)[0]
 
 
-def _lstm_forward(u: Array, inputs: Array, valid: Array) -> tuple[Array, Any]:
+def _lstm_forward(weights: Array, x: Array, valid: Array) -> tuple[Array, Any]:
     # The barriers keep XLA from computing each tanh once for every use of it, which doubled the time of a step.
     barrier = jax.lax.optimization_barrier
-    share = valid / jnp.maximum(valid.sum(0), 1).astype(inputs.dtype)
+    share = valid / jnp.maximum(valid.sum(0), 1).astype(x.dtype)
+    size = weights.shape[1] // 4
+    u, w, b = weights[:size], weights[size:-1], weights[-1]
+    inputs = (x.reshape(-1, x.shape[-1]) @ w + b).reshape(*valid.shape, -1)
 
-    def step(carry: Any, x: Any) -> Any:
+    def step(carry: Any, now: Any) -> Any:
         h, s, mean = carry
-        z, on, share = x
+        z, on, share = now
         t = barrier(jnp.tanh(z + h @ u))
         i, f, o, c = _gates(t)
         s_next = barrier(f * s + i * c)
@@ -157,17 +161,17 @@ def _lstm_forward(u: Array, inputs: Array, valid: Array) -> tuple[Array, Any]:
 
     zeros = jnp.zeros((inputs.shape[1], u.shape[0]), inputs.dtype)
     (_, _, mean), saved = jax.lax.scan(step, (zeros, zeros, zeros), (inputs, valid, share))
-    return mean, (u, valid, share, saved)
+    return mean, (u, w, x, valid, share, saved)
 
 
 def _lstm_backward(residuals: Any, dmean: Array) -> tuple[Array, Array, None]:
-    u, valid, share, (hs, ss, ts, boundeds) = residuals
+    u, w, x, valid, share, (hs, ss, ts, boundeds) = residuals
     barrier = jax.lax.optimization_barrier
     u_transposed = u.T
 
-    def step(carry: Any, x: Any) -> Any:
+    def step(carry: Any, now: Any) -> Any:
         dh, ds = carry
-        s, t, bounded, on, share = x
+        s, t, bounded, on, share = now
         on, dh = on[:, None], dh + share[:, None] * dmean
         i, f, o, c = _gates(t)
         dh_on, ds_on = jnp.where(on, dh, 0.0), jnp.where(on, ds, 0.0)
@@ -178,9 +182,10 @@ def _lstm_backward(residuals: Any, dmean: Array) -> tuple[Array, Array, None]:
 
     zeros = jnp.zeros_like(dmean)
     _, dzs = jax.lax.scan(step, (zeros, zeros), (ss, ts, boundeds, valid, share), reverse=True)
-    # one large product after the loop, not one small one in every step
-    du = hs.reshape(-1, hs.shape[-1]).T @ dzs.reshape(-1, dzs.shape[-1])
-    return du, dzs, None
+    # one large product after the loop, not one small one in every step: those of few rows are slow on a CPU
+    dzs = dzs.reshape(-1, dzs.shape[-1])
+    given = jnp.concatenate([hs, x, jnp.ones((*valid.shape, 1), x.dtype)], axis=-1)
+    return given.reshape(dzs.shape[0], -1).T @ dzs, (dzs @ w.T).reshape(x.shape), None
 
 
 _lstm.defvjp(_lstm_forward, _lstm_backward)
@@ -234,10 +239,13 @@ def _shapes(features: int, widths: tuple[int, ...]) -> list[tuple[int, int]]:
 
 
 def _read(layers: list[dict[str, Array]], x: Float[Array, "*n features"]) -> Float[Array, "*n size"]:
-    """Layers that all steps share."""
+    """Layers that all steps share; the bias is the weight of a column of ones, so that its slope is no sum apart."""
+    flat = x.reshape(-1, x.shape[-1])
+    ones = jnp.ones((flat.shape[0], 1), x.dtype)
     for layer in layers:
-        x = jax.nn.gelu(x @ layer["w"] + layer["b"])
-    return x
+        weights = jnp.concatenate([layer["w"], layer["b"][None]])
+        flat = jax.nn.gelu(jnp.concatenate([flat, ones], axis=1) @ weights)
+    return flat.reshape(*x.shape[:-1], flat.shape[-1])
 
 
 @struct.dataclass
